@@ -61,8 +61,8 @@ class Bubble:
     """Member ``i`` of the states ``x`` of a model, its vapour ``smeared``. ``n`` unknowns, ``start`` (n,)."""
 
     def __init__(self, model: BubbleModel, x: Array, i: int, smeared: float = 0.0) -> None:
-        packed = pack(model, x, 0.0, np.ones((len(x), 1)))
-        members, solver, system = packed.members, model.solver, model.system
+        members, memory, viscous, pulse = pack(model, x, 0.0, np.ones((len(x), 1)))
+        solver, system = model.solver, model.system
         self.start, self.n = members.initial[i].copy(), system.size
         self._atol = system.tolerances(1.0)[0]
         wall = system.wall_row if system.wall else -1
@@ -75,7 +75,7 @@ class Bubble:
             scratch.elastic[:] = from_values(members.factor * np.repeat(members.samples[i : i + 1], WIDTH, axis=0))
         else:
             scratch.elastic[:] = members.tables[i]
-        equations = solver.equations(packed.memory, packed.viscous, packed.pulse, cells > GRID.cells)
+        equations = solver.equations(memory, viscous, pulse, cells > GRID.cells)
         self._rest = wall, equations, par, scratch.elastic, scratch
         self._lanes, self._found = np.empty((self.n, WIDTH)), np.empty((self.n, WIDTH))
 

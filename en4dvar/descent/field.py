@@ -185,7 +185,6 @@ class FieldObjective(Objective[FieldDescent]):
         self.errors = data.perturbations(seed, "En4D-Var field", range(len(anomalies)))
 
     def start(self) -> FieldDescent:
-        """The descent at the prior mean."""
         first = self.data.predict(lambda _: self.mean[None], 1)[0]
         descent = FieldDescent(self.mean.copy(), first, forward_runs=1)
         descent.costs.append(self.cost(descent.prediction, (), ()))

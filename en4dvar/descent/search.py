@@ -153,7 +153,6 @@ class Search:
         return [i for i in self.space.affordable(self.run) if i not in outcome.tried]
 
     def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
-        """After descents from these members side by side."""
         self.over, began = self.over + 1, self.space.forward_runs
         rival, minima = self._compared(outcome, members)
         after = replace(outcome, minima=merged([*outcome.minima, *minima]), tried=(*outcome.tried, *members))

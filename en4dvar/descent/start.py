@@ -49,7 +49,7 @@ def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], Non
     scheme, beyond = space.minimiser, len(space.members) + 1  # the latter numbers what is no member
     if scheme.lengthen > 1:
         led = lengthened(space, run, tell)
-        return Outcome(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
+        return Outcome(Descent(space.weights_at(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
     if not isinstance(begin, str):
@@ -103,7 +103,7 @@ def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]
     """
     w: Array | None = None
     for number, short in enumerate(shortened(space)):
-        descent = choose_start(short, run, tell=tell).descent if w is None else Descent(short.start(w))
+        descent = choose_start(short, run, tell=tell).descent if w is None else Descent(short.weights_at(w))
         descent.ended = False
         minimise(DataWindow(short), [descent])
         w = descent.weights.w
@@ -121,12 +121,12 @@ def descent_from(space: WeightSpace, member: int) -> Descent:
     """
     count = len(space.members)
     w = np.zeros(count) if member == count else np.asarray(space.basis @ space.basis[member])
-    return Descent(space.start(w), members=(member,))
+    return Descent(space.weights_at(w), members=(member,))
 
 
 def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
     """One that starts at a control vector x (n,) that is no member."""
-    return Descent(space.start(space.weights_of(x)), members=(number,))
+    return Descent(space.weights_at(space.weights_of(x)), members=(number,))
 
 
 def given(problem: InverseProblem, start: Mapping[str, float | Mapping[str, float]]) -> Array:
@@ -171,7 +171,7 @@ class Rounds(DataWindow):
         self.known, self.rounds, self.plausible = known, 0, highest_plausible(space)
         bounded = np.any(sides_of(self.observations.noise))  # of flat J a rough end is anywhere
         self.rough = space.minimiser.cost_tolerance if bounded else ROUGH
-        self.lowest = lowest or Descent(space.start(np.zeros(len(space.members))))
+        self.lowest = lowest or Descent(space.weights_at(np.zeros(len(space.members))))
         self.descents, self.minima = list[Descent](), list[Minimum]()
 
     def begin_round(self, descents: list[Descent]) -> None:
@@ -213,7 +213,7 @@ class Rounds(DataWindow):
             step, before = descent.newton, descent.cost
             if move is not None:
                 self.record(descent, step.hessian.economical_transform, move.step_length)
-                descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
+                descent.weights, descent.cost = self.space.weights_at(move.w, step.hessian), move.cost
                 rough = max(before - move.cost, step.predicted_decrease) <= self.rough * max(1.0, move.cost)
                 descent.ended = rough or descent.iteration == self.space.minimiser.max_iterations
             else:

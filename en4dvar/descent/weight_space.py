@@ -42,7 +42,6 @@ class WeightSpace:
 
     @property
     def minimiser(self) -> Minimiser:
-        """The scheme, of descents to the minimum of J."""
         assert self.scheme.minimiser is not None
         return self.scheme.minimiser
 
@@ -88,18 +87,14 @@ class WeightSpace:
             return np.vstack([middle + transform @ self.anomalies, middle])
         return self.control(np.vstack([w + transform, w]))
 
-    def start(self, w: Array) -> Weights:
-        """Weights of a descent from w (N,), with the transform of the prior."""
-        return Weights(w, np.eye(len(w)) if self._reads_transform else NOT_READ)
+    def weights_at(self, w: Array, hessian: Hessian | None = None) -> Weights:
+        """Weights of a descent at w (N,), with the transform of the prior, or of the Hessian where it comes from.
 
-    def onwards(self, w: Array, hessian: Hessian) -> Weights:
-        """Weights of a descent at w (N,), with the transform of where it comes from."""
-        return Weights(w, hessian.transform if self._reads_transform else NOT_READ)
-
-    @property
-    def _reads_transform(self) -> bool:
-        """Few members take it along in any case; of many, only a regression over the ensemble asks for it."""
-        return len(self.members) <= FEW or (self.scheme.minimiser is not None and self.scheme.minimiser.regresses)
+        Few members take it along in any case; of many, only a regression over the ensemble asks for it.
+        """
+        if len(self.members) > FEW and not (self.scheme.minimiser and self.scheme.minimiser.regresses):
+            return Weights(w, NOT_READ)
+        return Weights(w, np.eye(len(w)) if hessian is None else hessian.transform)
 
     def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         self.forward_runs += len(x)
@@ -165,7 +160,6 @@ def require_members(problem: InverseProblem, run: Forecast, needed: int, stage: 
 
 
 def _lacking(problem: InverseProblem, readings: Sequence[int]) -> str:
-    """Which readings too few members have, and what to do."""
     if not readings:
         return ""
     parts, times = problem.parts, problem.observations.times

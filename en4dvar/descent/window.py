@@ -47,7 +47,6 @@ class Iterate:
 
     @property
     def cost(self) -> float:
-        """J = J_b + J_o."""
         return self.background + self.observation
 
 
@@ -90,7 +89,6 @@ class Descent(Descends):
 
     @property
     def iterate(self) -> Iterate:
-        """Where it stands, once the runs are there."""
         assert self.at is not None
         return self.at
 
@@ -172,7 +170,6 @@ class DataWindow(Objective[Descent]):
         return np.array([reference + (at - centre) @ basis @ anomalies for at, centre, reference, anomalies in each])
 
     def searched(self, descent: Descent) -> Search:
-        """By the configured step control."""
         point = self._point(descent)
         search = STEP_CONTROLS[self.space.minimiser.step_control](point)
         return each_once(search) if point.sparing else search
@@ -269,7 +266,7 @@ class DataWindow(Objective[Descent]):
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
-        return replace(self.space.onwards(w, descent.newton.hessian), wider=descent.weights.wider)
+        return replace(self.space.weights_at(w, descent.newton.hessian), wider=descent.weights.wider)
 
     def _take(self, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""

@@ -84,7 +84,6 @@ class Dependence:
 
     @property
     def log_det_root(self) -> float:
-        """ln det L."""
         return float(np.sum(np.log(np.diag(self.root))))
 
     def whitened(self, y: Array) -> Array:

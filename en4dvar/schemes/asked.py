@@ -33,7 +33,6 @@ def _wrong(scheme: Scheme, method: str, words: str) -> ConfigError:
 
 
 def members_of(scheme: Scheme, weights: Weights, basis: Array | None = None) -> Array:
-    """:meth:`Scheme.members`."""
     rows, n = _asked(scheme, "members", weights, *([] if basis is None else [basis])), len(weights.w)
     if np.ndim(rows) != 2 or np.shape(rows)[1] != n or not math.isfinite(np.sum(rows)):
         raise _wrong(scheme, "members", f"gives shape {np.shape(rows)}; it gives finite numbers of shape (M, {n})")
@@ -41,7 +40,6 @@ def members_of(scheme: Scheme, weights: Weights, basis: Array | None = None) -> 
 
 
 def linearised(scheme: Scheme, weights: Weights, runs: Runs) -> tuple[Array, Array]:
-    """:meth:`Scheme.linearise`."""
     told, size = _asked(scheme, "linearise", weights, runs), runs.predictions.shape[1]
     n = len(weights.w) if scheme.minimiser is None or runs.basis is None else runs.basis.shape[1]
     shapes = [np.shape(part) for part in told] if isinstance(told, tuple | list) else type(told).__name__
@@ -54,7 +52,6 @@ def linearised(scheme: Scheme, weights: Weights, runs: Runs) -> tuple[Array, Arr
 def step_of(
     scheme: Scheme, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw
 ) -> Step | GaussNewtonStep:
-    """:meth:`Scheme.advance`."""
     step, n = _asked(scheme, "advance", weights, evaluation, iteration, draw), len(weights.w)
     if isinstance(step, GaussNewtonStep):
         return step

@@ -14,7 +14,7 @@ shrinkage, Liu & West (2001), in Doucet et al., Sequential Monte Carlo Methods i
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, cast
+from typing import Annotated, cast
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -30,14 +30,14 @@ from en4dvar.schemes.filters import ETKF
 class BootstrapFilter(ETKF):
     """The filter; it takes no localisation."""
 
-    words: ClassVar[str] = "weighed and resampled members"
+    words = "weighed and resampled members"
 
     jitter: Annotated[
         float, Ge(0), Le(1), "What a resampled member is moved by at most, in standard deviations of the posterior."
     ] = 0.2
 
-    on: ClassVar[tuple[str, ...]] = ("series",)
-    resamples: ClassVar[bool] = True
+    on = ("series",)
+    resamples = True
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Resampled members as rows of weights: a member is x̄ + X_a(i), one that has survived."""

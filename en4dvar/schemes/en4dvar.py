@@ -9,7 +9,6 @@ Sources: Sakov, Oliver & Bertino (2012), Mon. Wea. Rev. 140, 1988; Bocquet & Sak
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -32,10 +31,8 @@ class En4DVar(Minimiser):
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
 
-    words: ClassVar[str] = "iterative ensemble smoother"
-    localised_keys: ClassVar[frozenset[str] | None] = frozenset(
-        ("epsilon", "max_iterations", "step_tolerance", "cost_tolerance")
-    )
+    words = "iterative ensemble smoother"
+    localised_keys = frozenset(("epsilon", "max_iterations", "step_tolerance", "cost_tolerance"))
 
     def economical(self, basis: Array) -> bool:
         n_members, rank = basis.shape

@@ -26,7 +26,6 @@ Sources: Bocquet (2011), Nonlin. Processes Geophys. 18, 735; dual: Bocquet & Sak
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -40,7 +39,7 @@ from en4dvar.schemes.filters import ETKF
 class EnKFN(ETKF):
     """The filter; it needs no inflation where the model is right."""
 
-    words: ClassVar[str] = "finite size"
+    words = "finite size"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         n_members = len(weights.w)

@@ -14,7 +14,7 @@ Sources: Emerick & Reynolds (2013), Computers & Geosciences 55, 3; square root: 
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Gt, MinLen
@@ -33,7 +33,7 @@ class ESMDA(ETKF):
     [9.33, 7.0, 4.0, 2.0]
     """
 
-    words: ClassVar[str] = "multiple data assimilation"
+    words = "multiple data assimilation"
 
     mda_coefficients: Annotated[
         tuple[Annotated[float, Gt(0)], ...],
@@ -44,8 +44,8 @@ class ESMDA(ETKF):
         "perturbed"
     )
 
-    on: ClassVar[tuple[str, ...]] = ("window",)
-    localised_keys: ClassVar[frozenset[str] | None] = frozenset(("mda_coefficients",))
+    on = ("window",)
+    localised_keys = frozenset(("mda_coefficients",))
 
     def __post_init__(self) -> None:
         if not self.mda_coefficients or not all(alpha > 0 for alpha in self.mda_coefficients):

@@ -27,9 +27,9 @@ class ETKF(Scheme):
     129, 420; symmetric root: Hunt, Kostelich & Szunyogh (2007), Physica D 230, 112.
     """
 
-    words: ClassVar[str] = "symmetric square root"
+    words = "symmetric square root"
     on: ClassVar[tuple[str, ...]] = ("window", "series")
-    filters: ClassVar[bool] = True
+    filters = True
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class DEnKF(ETKF):
     & Oke (2008), Tellus A 60, 361.
     """
 
-    words: ClassVar[str] = "deterministic"
-    approximate: ClassVar[str] = "moves anomalies by half of the gain, which leaves them wider than the posterior"
+    words = "deterministic"
+    approximate = "moves anomalies by half of the gain, which leaves them wider than the posterior"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         step = gauss_newton(weights.w, evaluation)
@@ -65,8 +65,8 @@ class EnKF(ETKF):
     Sources: Burgers, van Leeuwen & Evensen (1998), Mon. Wea. Rev. 126, 1719; Evensen (2003), Ocean Dynamics 53, 343.
     """
 
-    words: ClassVar[str] = "perturbed observations"
-    perturbs: ClassVar[bool] = True
+    words = "perturbed observations"
+    perturbs = True
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         hessian, n = Hessian.of(evaluation.S), len(weights.w)
@@ -103,7 +103,7 @@ class ESRF(ETKF):
     10–13.
     """
 
-    words: ClassVar[str] = "serial square root"
+    words = "serial square root"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         w, transform, prior_precision = weights.w.copy(), weights.T.copy(), len(weights.w) - 1.0
@@ -126,18 +126,18 @@ class OptimalInterpolation(ETKF):
     does (Whitaker & Hamill 2002, eq. 10). Source: Gandin (1963), Objective Analysis of Meteorological Fields.
     """
 
-    words: ClassVar[str] = "one analysis of the free members"
-    on: ClassVar[tuple[str, ...]] = ("series",)
-    cycled: ClassVar[bool] = False
-    climatological: ClassVar[bool] = True
+    words = "one analysis of the free members"
+    on = ("series",)
+    cycled = False
+    climatological = True
 
 
 @dataclass(frozen=True)
 class Climatology(OptimalInterpolation):
     """A baseline: mean and spread of the free members; observations are not used."""
 
-    words: ClassVar[str] = "the free members"
-    climatological: ClassVar[bool] = False
+    words = "the free members"
+    climatological = False
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         return Step(weights, 0.0)

@@ -18,7 +18,7 @@ strongly nonlinear F keeps to one minimum. In the linear case it is the same smo
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -37,7 +37,7 @@ class IEnKS(Scheme):
     ``transform``: members at the rows of 1wᵀ + T, Y = T⁻¹(P − p̄). ``bundle``: at 1wᵀ + εI, Y = (P − p̄)/ε.
     """
 
-    words: ClassVar[str] = "sliding-window smoother"
+    words = "sliding-window smoother"
 
     lag: Annotated[int, Ge(0), "Length of the smoother's window in cycles; 0 is a filter."] = 1
     linearisation: Annotated[
@@ -56,7 +56,7 @@ class IEnKS(Scheme):
         "numbers relative to each other; by default it counts once.",
     ] = (1.0,)
 
-    on: ClassVar[tuple[str, ...]] = ("series",)
+    on = ("series",)
 
     def __post_init__(self) -> None:
         if self.shift > max(1, self.lag):

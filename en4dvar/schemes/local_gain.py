@@ -19,7 +19,6 @@ Gains are applied to parts of the field, so that memory beside the ensemble is o
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -54,15 +53,7 @@ class Split:
 
     @property
     def whole(self) -> Array:
-        """Their sum."""
         return self.placed + self.common
-
-
-class Gain(Protocol):
-    """How a localised gain acts."""
-
-    def update(self, Y: Array, variance: Array, innovations: Array) -> Update:
-        """Increments of M members from ``innovations`` (M, K), with anomalies ``Y`` (N, K), error ``variance`` (K,)."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +108,7 @@ class ByDistance:
         return np.asarray(dual @ cross.T)
 
     def update(self, Y: Array | Split, variance: Array, innovations: Array) -> Update:
+        """Increments of M members from ``innovations`` (M, K), with anomalies ``Y`` (N, K), error ``variance`` (K,)."""
         dual = cho_solve(cho_factor(self.between(Y, Y) + np.diag(variance)), innovations.T).T
         return lambda part, anomalies: self.along(part, anomalies, Y, dual)
 
@@ -128,6 +120,7 @@ class ByCorrelation:
     threshold: float | None = None
 
     def update(self, Y: Array, variance: Array, innovations: Array) -> Update:
+        """As :meth:`ByDistance.update`."""
         n_members = len(Y)
         least = CHANCE / np.sqrt(n_members) if self.threshold is None else self.threshold
         covariance = Y.T @ Y / (n_members - 1)
@@ -158,6 +151,9 @@ class ByCorrelation:
             return change
 
         return increments
+
+
+Gain = ByDistance | ByCorrelation
 
 
 def parts(size: int, width: int) -> Iterator[slice]:

@@ -22,7 +22,6 @@ FARTHEST = 30.0  # difference of log-evidences that the axis shows
 
 
 def all_figures(study: Study) -> Iterator[Captioned]:
-    """Every figure."""
     count = "; ".join(f"{len(study.any_fit(gel).problems)} in {gel} gel" for gel in study.fits)
     yield "scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study)
     for fit in study.every_fit:
@@ -171,7 +170,8 @@ def combined(study: Study, fit: Fit) -> Chart:
     """Histograms of all posterior members with prior, mean and (twin) the truths."""
     panels: list[Panel] = []
     for q in R0_FIRST:
-        values, prior = fit.members(q.name) * q.factor, fit.prior_members(q.name) * q.factor
+        values, j = fit.members(q.name) * q.factor, fit.prior.names.index(q.name)
+        prior = np.concatenate([a.prior[:, j] for a in fit.analyses]) * q.factor
         low, high = map(float, np.quantile(values, (0.001, 0.999)))
         edges = np.linspace(low, high, 31)
         panel = Panel(_label(q), yticks=(), left=False, legend=not panels)

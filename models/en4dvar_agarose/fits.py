@@ -59,7 +59,6 @@ class Fit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the data sets."""
         return tuple(p.observations.name for p in self.problems)
 
     @property
@@ -107,11 +106,6 @@ class Fit:
         stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
         return np.asarray(stacked[np.isfinite(stacked)])
 
-    def prior_members(self, name: str) -> Array:
-        """(S·N,) members of the priors of all sets, SI."""
-        j = self.prior.names.index(name)
-        return np.concatenate([a.prior[:, j] for a in self.analyses])
-
 
 @dataclass(frozen=True)
 class Study:
@@ -129,7 +123,6 @@ class Study:
 
     @property
     def every_fit(self) -> tuple[Fit, ...]:
-        """Of all gels and models, in their order."""
         return tuple(fit for models in self.fits.values() for fit in models.values())
 
     def any_fit(self, gel: str) -> Fit:

@@ -74,7 +74,6 @@ class StudyCheckpoints:
             directory.publish()
 
     def sweep(self, *words: str) -> Path:
-        """The folder of a sweep's chunks."""
         folder = self.directory.folder(f"{FOLDER}/{named('sweep', *words)}")
         for half_written in folder.glob(".*.tmp"):  # of a process that was killed
             half_written.unlink()

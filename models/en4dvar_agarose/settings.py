@@ -68,7 +68,6 @@ class StudyPlan:
 
     @property
     def named(self) -> dict[str, Config]:
-        """The configurations by gel and model, in words."""
         return {f"{gel}, {model}": config for gel, models in self.configs.items() for model, config in models.items()}
 
 

@@ -39,8 +39,6 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table."""
-
     gel: str
     model: Model
     cells: tuple[Cell, ...]

@@ -97,8 +97,6 @@ class Enter(Guarded):
 
 
 class Own(Guarded):
-    """The page itself."""
-
     def get(self, name: str) -> None:
         path = HERE / (name or "page.html")
         self.set_header("Content-Type", KINDS[path.suffix])

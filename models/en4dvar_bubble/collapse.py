@@ -32,11 +32,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import stdtrit
 
 from en4dvar.data.extrema import maxima
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble.medium import Medium
@@ -87,7 +86,6 @@ class Lobe:
     margin: float = 0.0
 
     def rayleigh_ratio(self, medium: Medium) -> float:
-        """The collapse time over Rayleigh's."""
         return self.t_c / (RAYLEIGH * self.R_max * math.sqrt(medium.rho / medium.p_inf))
 
 
@@ -165,7 +163,7 @@ class Expected:
     """Ratios (M,) of the prior members, and whether each is a ``common`` gel, no stiffer or thicker than granted."""
 
     ratios: Array
-    common: npt.NDArray[np.bool_]
+    common: Mask
 
     def like(self, ratio: float, short: bool) -> bool:
         """True if a common gel comes as far to that side."""
@@ -269,7 +267,7 @@ def doubts(
     return (caution("implausible-data", words, "caution" if told and conceivable(view, medium) else None),)
 
 
-def _common(members: Mapping[str, Array], count: int) -> npt.NDArray[np.bool_]:
+def _common(members: Mapping[str, Array], count: int) -> Mask:
     """Of members, whether neither G nor μ, where the law has one, is beyond what is granted."""
     within = np.ones(count, dtype=bool)
     for name, most in COMMON._asdict().items():

@@ -94,7 +94,6 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     @property
     def path_parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Those of the law."""
         return tuple(p.name for p in self.law.parameters)
 
     @property
@@ -173,8 +172,8 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        packed = pack(self, x, t0 * 1e6, micro, halved)
-        work, solved = self.solver.prepared(*packed)
+        members, *tables = pack(self, x, t0 * 1e6, micro, halved)
+        work, solved = self.solver.prepared(members, *tables)
 
         def finish() -> Paths:
             solution = solved
@@ -183,7 +182,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
                 states = solution.states[np.arange(len(x))[:, None], back]
                 states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
                 solution = Solution(states, solution.status, solution.record)
-            return self._followed(Paths(self, x, times, solution, packed.members.parameters, t0), packed.members)
+            return self._followed(Paths(self, x, times, solution, members.parameters, t0), members)
 
         return work, finish
 

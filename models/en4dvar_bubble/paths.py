@@ -4,7 +4,7 @@ of the state vector are computed from the raw solution when they are asked for.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -58,16 +58,14 @@ class Paths(Batch):
         if isinstance(name, slice):
             return [self[i] for i in range(*name.indices(len(self)))]
         if not isinstance(name, str):
-            return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
+            if not self.solution.status[name]:
+                return BubbleTrajectory(self, name)
+            return Failure(self.solution.reason(name), float(self.solution.record[name, END_TIME]) * 1e-6)
         if name not in self._fields:
             estimated = name in {p.name for p in self.model.parameters}
             compute = None if estimated else OF_WHOLE.get(name)
             self._fields[name] = compute(self) if compute else self._constant(name)
         return self._fields[name]
-
-    def failure(self, member: int) -> Failure:
-        """Why and when (s) a member's integration ended early."""
-        return Failure(self.solution.reason(member), float(self.solution.record[member, END_TIME]) * 1e-6)
 
     def largest(self, name: str) -> Array:
         """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
@@ -97,7 +95,6 @@ class Paths(Batch):
         return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
 
     def medium(self, axes: int) -> Medium:
-        """See :meth:`Dynamics.medium_of`."""
         return self.model.medium_of(self.model.parameter_values(self.initial), axes)
 
     def _constant(self, name: str) -> Array:
@@ -183,11 +180,9 @@ class BubbleTrajectory(Trajectory):
         return cast(Array, self.paths[name][self.member])
 
     def largest(self, name: str) -> float:
-        """See :meth:`Paths.largest`."""
         return float(self.paths.largest(name)[self.member])
 
     def beyond(self, limit: ValidityLimit) -> float:
-        """See :meth:`Paths.beyond`."""
         return float(self.paths.beyond(limit)[self.member])
 
     @property
@@ -199,26 +194,18 @@ _NO_TABLE = np.zeros((0, GRID.cells, 8))
 _NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
 
-class Packed(NamedTuple):
-    """N members in the kernel's units, and the tables that their laws and the driving add to the equations."""
-
-    members: Members
-    memory: Array
-    viscous: Array
-    pulse: Array
-
-
-def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False) -> Packed:
-    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs. ``halved``: with
-    halved cells in the elastic tables, whatever the law.
+def pack(
+    model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False
+) -> tuple[Members, Array, Array, Array]:
+    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs, in the kernel's
+    units; tables of memory, viscosity and pulse. ``halved``: with halved cells in the elastic ones, whatever the law.
     """
     law, system, own = model.law, model.system, model.parameter_values(x)
     values = model.law_values(own)
     rho = model.medium_of(own).rho
     initial, par = _states(model, x, own)
     n_members = len(x)
-    clocks = model.driving.of_members(own)
-    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE] = clocks[:3]
+    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE], pulse = model.driving.of_members(own)
     memory = viscous = _NO_TABLE
     if system.memory:
         memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
@@ -247,7 +234,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: 
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return Packed(members, memory, viscous, clocks.table)
+    return members, memory, viscous, pulse
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:

@@ -4,10 +4,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.model.state import Array, Mask
@@ -18,7 +16,6 @@ from en4dvar_movie.frames import Frame, Movie, saturated
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
 from en4dvar_movie.surfaces import is_round, smooth_surface, surface_beside_discs
 
-Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
 FLICKER = 0.2  # of the brightness: what a lamp may change, whatever else the frame shows
@@ -197,7 +194,7 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame], range]:
     return leading, samples, range(0, every * len(samples), every)
 
 
-def pixel_noise(image: Image, unit: float = 1.0) -> float:
+def pixel_noise(image: Frame, unit: float = 1.0) -> float:
     """Std of the noise of an image (H, W): robust, of differences between neighbours. ``unit``: a grey level."""
     return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3 * unit)
 
@@ -252,13 +249,13 @@ def _burnt_in(frames: Sequence[Frame]) -> Mask:
     return np.asarray(np.isin(of, [n for n in numbers[sharp] if not is_round(labels == n)]) & (off <= about))
 
 
-def _lit_as(frame: Image, other: Image) -> Image:
+def _lit_as(frame: Frame, other: Frame) -> Frame:
     """A frame (H, W) in the light of another, where their lamp's brightness differs no more than it flickers."""
     lamp = float(np.median(np.maximum(other, 1e-6) / np.maximum(frame, 1e-6)))
     return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
 
 
-def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> Mask:
+def _changed(frame: Frame, other: Frame, noise: float, side: int = 5) -> Mask:
     """Where two frames differ by more than noise, in means over squares, whatever the lamp does (H, W)."""
     off = ndimage.uniform_filter(frame - _lit_as(other, frame), side)
     return np.asarray(np.abs(off) > max(7 * noise / side, 0.06 * float(np.median(other))))
@@ -286,7 +283,7 @@ def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     return none
 
 
-def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice, slice]) -> bool:
+def _one_way(frames: Sequence[Frame], changes: Sequence[Frame], box: tuple[slice, slice]) -> bool:
     """True if, from frame to frame, all that changes becomes darker or all becomes brighter, as about a bubble."""
     mixed: list[float] = []
     for (a, b), changed in zip(pairwise(frames), changes, strict=True):
@@ -296,7 +293,7 @@ def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice
     return float(np.median(mixed or [0.0])) < 0.15
 
 
-def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
+def _begins_with_a_bubble(first: Frame, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
     """True if the first frame has edges, or a shade over most of its border, that most frames lack; or if it differs
     from a smooth surface in large patches whose rims other frames show elsewhere.
     """
@@ -322,7 +319,7 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
     return bool(np.mean(moved[edge]) > LIVELY)
 
 
-def _edges_of_first(first: Image, frame: Image, changed: Mask, noise: float) -> float | None:
+def _edges_of_first(first: Frame, frame: Frame, changed: Mask, noise: float) -> float | None:
     """The share of the edges about what changed in a frame (H, W) that the first frame shows, 1/2 of a disc that shrank
     a little; None where nothing large changed. In logarithms: a shade that falls on structure adds none of it.
     """
@@ -339,7 +336,7 @@ def _edges_of_first(first: Image, frame: Image, changed: Mask, noise: float) -> 
     return -float(np.sum(change * before) + own) / max(float(np.sum(change**2) - own - other), float(own + other))
 
 
-def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: Mask) -> int:
+def _quiet(leading: Sequence[Frame], first: Frame, noise: float, blind: Mask) -> int:
     """How many leading frames look like the first; most of those after them show the shade in a bubble's middle."""
     for number, frame in enumerate(leading):
         labels, sizes = labelled(_changed(frame.astype(np.float32), first, noise) & ~blind)
@@ -434,7 +431,7 @@ def share_changed(tiles: Array, noise: float) -> float:
 
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """What the sampled frames say of contrast, sharpness and rim. Raises :class:`DataError` where none has a bubble."""
-    shown: list[tuple[Image, Outline]] = []
+    shown: list[tuple[Frame, Outline]] = []
     clipped: list[float] = []
     full = saturated(samples)
     for frame, image, ((place, contrast), *_) in _steadied(background, samples):
@@ -464,7 +461,7 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     )
 
 
-def _again(shown: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:
+def _again(shown: Sequence[tuple[Frame, Outline]], optics: Optics, circles: int) -> list[Outline]:
     fitted = [fit_outline(image, outline.circle, optics, circles) for image, outline in shown]
     return [outlines[0] for outlines in fitted if outlines is not None]
 

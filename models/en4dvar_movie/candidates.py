@@ -36,7 +36,6 @@ class Candidate:
 
     @property
     def circle(self) -> Circle:
-        """The outermost."""
         return self.outlines[0].circle
 
 

@@ -7,14 +7,13 @@ import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from en4dvar.model.state import Indices
 from en4dvar.plumbing.errors import DataError
 
 MOST_PIXELS = 64_000_000  # of a frame
@@ -36,29 +35,6 @@ TIMES = {
 }
 
 
-@dataclass(frozen=True)
-class TiffAbout:
-    """What a TIFF file says of itself: ``pixel`` (m) and ``rate`` (1/s) are NaN where it says nothing.
-
-    ``count`` frames of ``shape`` in ``pages``; those of a ``plain`` file begin at byte ``start`` and have ``frame``
-    bytes of ``kind``. ``broken``: the directory of pages leads nowhere. Each frame has ``colours`` pages. ``notes`` are
-    why something that the file says is not used.
-    """
-
-    pages: int
-    count: int
-    shape: tuple[int, ...]
-    kind: str
-    start: int
-    frame: int
-    plain: bool
-    pixel: float
-    rate: float
-    broken: bool
-    colours: int
-    notes: tuple[str, ...]
-
-
 def library(name: str) -> ModuleType:
     from importlib import import_module
 
@@ -69,15 +45,15 @@ def library(name: str) -> ModuleType:
 
 
 @contextmanager
-def _overheard(name: str) -> Iterator[list[str]]:
-    """Within, what a library logs is kept as a list instead of shown."""
+def _overheard() -> Iterator[list[str]]:
+    """Within, what tifffile logs is kept as a list instead of shown."""
     faults: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:
         faults.append(record.getMessage())
         return False
 
-    logger = logging.getLogger(name)
+    logger = logging.getLogger("tifffile")
     logger.addFilter(keep)
     try:
         yield faults
@@ -85,29 +61,27 @@ def _overheard(name: str) -> Iterator[list[str]]:
         logger.removeFilter(keep)
 
 
-def tiff_about(path: Path) -> Iterator[TiffAbout]:
+def tiff_about(path: Path) -> Iterator[tuple[int, tuple[int, ...], tuple[int, str] | None, float, float, list[str]]]:
+    """How many frames a TIFF holds, and their shape; of frames that follow each other behind a single page where they
+    begin, and their type; size of a pixel (m) and frame rate (1/s), NaN where it says nothing; what is not used of it.
+    """
     tifffile = library("tifffile")
     try:
-        with _overheard("tifffile") as faults, tifffile.TiffFile(path) as file:
-            pages, frames = len(file.pages), _pages(file, path)
+        with _overheard() as faults, tifffile.TiffFile(path) as file:
+            pages, colours, first = len(file.pages), _pages(file, path).shape[1], file.pages[0]
             about = dict(file.imagej_metadata or {})
-            first = file.pages[0]
-            pixel, of_pixel = _tiff_pixel(about, first.tags)
-            rate, of_rate = _tiff_rate(about)
-            yield TiffAbout(
-                pages,
-                int(about.get("images", pages)),
-                tuple(first.shape),
-                np.dtype(first.dtype).newbyteorder(file.byteorder).str,
-                first.dataoffsets[0],
-                first.nbytes,
-                bool(first.compression == 1),
-                pixel,
-                rate,
-                any("invalid page offset" in fault or "circular" in fault for fault in faults),
-                frames.shape[1],
-                tuple(f"{path}: {words}" for words in (of_pixel, of_rate) if words),
-            )
+            count, start = int(about.get("images", pages)), first.dataoffsets[0]
+            (pixel, of_pixel), (rate, of_rate) = _tiff_pixel(about, first.tags), _tiff_rate(about)
+            notes = [f"{path}: {words}" for words in (of_pixel, of_rate) if words]
+            kind = np.dtype(first.dtype).newbyteorder(file.byteorder).str
+            check_size(first.shape, path)
+            held = path.stat().st_size >= start + count * first.nbytes
+            if pages == 1 < count and first.compression == 1 and held:  # ImageJ's way beyond 4 GB
+                yield count, tuple(first.shape), (start, kind), pixel, rate, notes
+                return
+            if pages < count or any("invalid page offset" in fault or "circular" in fault for fault in faults):
+                raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
+            yield pages // colours, tuple(first.shape), None, pixel, rate, notes
     except DataError:
         raise
     except Exception as error:  # tifffile believes what a damaged file says of itself
@@ -116,7 +90,7 @@ def tiff_about(path: Path) -> Iterator[TiffAbout]:
 
 def tiff_frames(path: Path) -> Iterator[Any]:
     """Frames; the channels of one along its last axis, three as of a coloured picture."""
-    with _overheard("tifffile"), library("tifffile").TiffFile(path) as file:
+    with _overheard(), library("tifffile").TiffFile(path) as file:
         for numbers in _pages(file, path):
             check_size(file.pages[int(numbers[0])].shape, path)
             planes = [file.pages[int(number)].asarray() for number in numbers]
@@ -124,7 +98,7 @@ def tiff_frames(path: Path) -> Iterator[Any]:
             yield np.stack([*planes, *dark], axis=-1) if len(planes) > 1 else planes[0]
 
 
-def _pages(file: Any, path: Path) -> npt.NDArray[np.int64]:
+def _pages(file: Any, path: Path) -> Indices:
     """The pages (frames, colours) of each frame, by the axes that ImageJ, OME or tifffile has written.
 
     Raises :class:`DataError` where a frame has slices in depth, or more channels than colours.

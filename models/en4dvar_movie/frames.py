@@ -148,15 +148,14 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _tiff(path: Path) -> Movie:
-    about = decoded_whole(tiff_about, path, allowed=MOVIES, kind="a TIFF")
-    start, count, shape, scale = about.start, about.count, about.shape, (about.pixel, about.rate, list(about.notes))
-    check_size(shape, path)
-    if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:
-        kind = np.dtype(about.kind)  # ImageJ's way beyond 4 GB
-        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, *scale)
-    if about.pages < count or about.broken:
-        raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
-    return Movie(path, lambda: decoded(tiff_frames, path, allowed=MOVIES), about.pages // about.colours, *scale)
+    count, shape, block, pixel, rate, notes = decoded_whole(tiff_about, path, allowed=MOVIES, kind="a TIFF")
+
+    def read() -> Iterator[Frame]:
+        if block is None:
+            return decoded(tiff_frames, path, allowed=MOVIES)
+        return _blocks(path, block[0], count, np.dtype(block[1]), shape)
+
+    return Movie(path, read, count, pixel, rate, notes)
 
 
 def open_picture(path: Path) -> Any:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.model.state import Array, Indices, Mask
@@ -141,7 +140,7 @@ def locate(tiles: Array, noise: float) -> list[tuple[Circle, float]]:
     return result
 
 
-def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], Indices]:
+def labelled(mask: Mask) -> tuple[Any, Indices]:
     """The connected patches of a mask, and the size of each by its number; 0 of what belongs to none."""
     labels, _ = ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
@@ -149,7 +148,7 @@ def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], Indices]:
     return labels, sizes
 
 
-def rim(inside: npt.NDArray[Any]) -> Array:
+def rim(inside: Mask) -> Array:
     """Outermost points (K, 2), x and y, of each row and column of a patch, without those on the frame's border."""
     points = []
     for part in (inside, inside.T):

@@ -1,17 +1,14 @@
 """The background of a movie without an empty frame: the smooth surface beside which what differs is a disc."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.model.state import Array, Mask
 from en4dvar_movie.frames import Frame
 from en4dvar_movie.outline import LEAST_CONTRAST, MOST_PATCHES, circle_through, labelled, rim
 
-Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 ROUNDS, LEANINGS = 8, 30  # of a fit that leaves out what is far off, and of one that lies above most
 OFTEN = 90  # per cent of the frames that are darker than what begins an envelope
 WITHIN = 0.01  # weight of what lies within an envelope, as a share of that of what lies beyond it
@@ -126,13 +123,13 @@ def _terms(shape: tuple[int, ...]) -> Array:
     return np.stack([np.ones_like(x), x, y, x * y, x * x, y * y]).reshape(6, -1)
 
 
-def _fitted(terms: Array, values: Image, weights: Array | Mask) -> Array:
+def _fitted(terms: Array, values: Frame, weights: Array | Mask) -> Array:
     chosen = terms * weights.ravel()
     fitted = np.linalg.solve(chosen @ terms.T, chosen @ values.ravel().astype(float))
     return np.asarray((fitted @ terms).reshape(values.shape))
 
 
-def _trimmed(terms: Array, values: Image, kept: Mask, field: Mask, unit: float) -> Array:
+def _trimmed(terms: Array, values: Frame, kept: Mask, field: Mask, unit: float) -> Array:
     """The surface through the pixels that are ``kept`` at first, then through all of the field that lie near it."""
     for _ in range(ROUNDS):
         surface = _fitted(terms, values, kept & field)

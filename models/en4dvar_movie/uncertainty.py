@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
@@ -71,24 +71,22 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 
 def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
-    ratios, turns = _smoothed(outlines), _turns(outlines)
-    hidden, lasting = _hidden([o and (o.oval or o) for o in outlines], ratios)
-    beside = hidden + _bent(outlines, ratios, turns, optics, exposure) + _unseen(outlines, lasting)
-    factor = STUDENT * lasting / 6**0.5
-    return [
-        replace(_errors(o, ratio, variance, turned, optics), factor=factor) if o is not None else NOTHING
-        for o, ratio, variance, turned in zip(outlines, ratios, beside, turns, strict=True)
-    ]
+    frames, known = np.flatnonzero([o is not None for o in outlines]), [o for o in outlines if o is not None]
+    ratios, turns = _smoothed(known, frames), _turns(known)
+    hidden, lasting = _hidden([o.oval or o for o in known], ratios)
+    beside = hidden + _bent(known, frames, ratios, turns, optics, exposure) + _unseen(known, lasting)
+    factor, errors = STUDENT * lasting / 6**0.5, [NOTHING] * len(outlines)
+    for k, o, ratio, variance, turned in zip(frames, known, ratios, beside, turns, strict=True):
+        errors[k] = replace(_errors(o, ratio, variance, turned, optics), factor=factor)
+    return errors
 
 
-def _unseen(outlines: Sequence[Outline | None], lasting: float) -> Array:
-    """Variance of the radius (K,) where the frame's edge cuts an outline, and a circle is fitted to a part of it.
-
-    It is how far the radius of a circle is from that of an oval where that fits better by more than noise does; and
-    what a ``lasting`` mode 2 over R makes of it, as far as noise may hide that.
+def _unseen(known: Sequence[Outline], lasting: float) -> Array:
+    """Variance of the radius (K,) where the frame's edge cuts an outline: how far the radius of a circle is from that
+    of an oval that fits better by more than noise, and what a ``lasting`` mode 2 over R makes of it, as noise allows.
     """
-    where = [k for k, o in enumerate(outlines) if o is not None and o.seen < 1]
-    cut, variance = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
+    where, variance = [k for k, o in enumerate(known) if o.seen < 1], np.zeros(len(known))
+    cut = [known[k] for k in where]
     ovals = [o.oval for o in cut]
     off = np.array([(v.circle.R if v else o.circle.R) - o.circle.R for o, v in zip(cut, ovals, strict=True)])
     noise = np.array([v.variance * v.ratio if v else o.circle.R**2 for o, v in zip(cut, ovals, strict=True)])
@@ -113,20 +111,17 @@ def _beyond(squares: Array, noise: Array) -> Array:
 
 
 def _bent(
-    outlines: Sequence[Outline | None], ratios: Array, turns: Sequence[bool], optics: Optics, exposure: float
+    known: Sequence[Outline], frames: Indices, ratios: Array, turns: Sequence[bool], optics: Optics, exposure: float
 ) -> Array:
     """Variance of the radius (K,) for its curvature in time over the exposure (0: unknown, at most a step)."""
-    radii = np.array([np.nan if o is None else o.circle.R for o in outlines])
-    variance = np.zeros(len(radii))
-    variance[1:-1] = np.nan_to_num((exposure**2 * np.diff(radii, 2) / 24) ** 2)
-    steps = np.abs(np.diff(radii, prepend=np.nan, append=np.nan))
-    largest = np.nan_to_num(np.fmax(steps[:-1], steps[1:]), nan=np.inf)  # a frame without neighbours says nothing
+    radii = np.full(frames.max(initial=-1) + 3, np.nan)
+    radii[frames + 1] = [o.circle.R for o in known]
+    variance = np.nan_to_num((exposure**2 * np.diff(radii, 2) / 24) ** 2)[frames]
+    steps = np.abs(np.diff(radii))
+    largest = np.nan_to_num(np.fmax(steps[:-1], steps[1:]), nan=np.inf)[frames]  # without neighbours it says nothing
     explained = largest * (exposure or 1.0) / 12**0.5
-    widths = [o.width for o in outlines if o is not None]
-    sharp = max(optics.width, float(np.percentile(widths or [0.0], 25)))
-    for k, o in enumerate(outlines):
-        if o is None:
-            continue
+    sharp = max(optics.width, float(np.percentile([o.width for o in known] or [0.0], 25)))
+    for k, o in enumerate(known):
         if _excess(o, sharp, ratios[k], LIKELY) > explained[k] ** 2 + SHARP * sharp**2:
             moved = _moved(o, sharp)
             swept = moved / o.circle.R
@@ -145,26 +140,21 @@ def _moved(outline: Outline, sharp: float) -> float:
     return float(np.sqrt(max(outline.width**2 - sharp**2, 0.0)))
 
 
-def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
+def _turns(known: Sequence[Outline]) -> list[bool]:
     """True if the radius of a frame lies below, or above, those of both neighbours."""
-    where = [k for k, o in enumerate(outlines) if o is not None]
-    steps = np.diff([o.circle.R for o in outlines if o is not None])
-    turns = np.zeros(len(outlines), dtype=bool)
-    turns[where[1:-1]] = steps[:-1] * steps[1:] <= 0
+    steps, turns = np.diff([o.circle.R for o in known]), np.zeros(len(known), dtype=bool)
+    turns[1:-1] = steps[:-1] * steps[1:] <= 0
     return turns.tolist()
 
 
-def _smoothed(outlines: Sequence[Outline | None]) -> Array:
+def _smoothed(known: Sequence[Outline], frames: Indices) -> Array:
     """Sector scatter over pixel scatter, averaged over neighbours whose edge is as sharp and as complete."""
-    where = [k for k, o in enumerate(outlines) if o is not None]
-    logs = {k: (np.log(o.width), o.seen, o.ratio) for k in where if (o := outlines[k]) is not None}
-    smoothed = np.ones(len(outlines))
-    for k in where:
-        near = [j for j in range(k - NEIGHBOURS, k + NEIGHBOURS + 1) if j in logs]
-        alike = [
-            np.exp(-(((logs[j][0] - logs[k][0]) / 0.2) ** 2) - ((logs[j][1] - logs[k][1]) / 0.1) ** 2) for j in near
-        ]
-        smoothed[k] = float(np.average([logs[j][2] for j in near], weights=alike))
+    each, smoothed = [(np.log(o.width), o.seen, o.ratio) for o in known], np.ones(len(known))
+    first, end = np.searchsorted(frames, [frames - NEIGHBOURS, frames + NEIGHBOURS + 1])
+    for k, (width, seen, _) in enumerate(each):
+        near = each[first[k] : end[k]]
+        alike = [np.exp(-(((w - width) / 0.2) ** 2) - ((s - seen) / 0.1) ** 2) for w, s, _ in near]
+        smoothed[k] = float(np.average([ratio for *_, ratio in near], weights=alike))
     return smoothed
 
 
@@ -191,12 +181,12 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 
-def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, float]:
+def _hidden(outlines: Sequence[Outline], ratios: Array) -> tuple[Array, float]:
     """For the extent along the line of sight: the variance of each radius (K,), by what its own mode 2 or that of its
     neighbours has beside the one that all frames share, and the amplitude over R of the latter.
     """
-    where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
-    known, hidden = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
+    where = [k for k, o in enumerate(outlines) if o.amplitude(2) >= 0 and o.mode_std > 0]
+    known, hidden = [outlines[k] for k in where], np.zeros(len(outlines))
     if not known:
         return hidden, 0.0
     radii = np.array([o.circle.R for o in known])

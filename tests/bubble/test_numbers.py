@@ -37,12 +37,12 @@ def test_constants_reach_the_equations_as_if_they_were_set(kind):
         other = 1.07 * usual or 2000.0
         asked = model.with_parameters([parameter.name])
         x = asked.initial_states({**theta, parameter.name: np.array([usual, other])})
-        packed = pack(asked, x, 0.0, TIMES[None].repeat(2, 0)).members
+        packed = pack(asked, x, 0.0, TIMES[None].repeat(2, 0))[0]
         for i, value in enumerate((usual, other)):
             set_ = replace(model, medium=replace(model.medium, **{constant: value}))
             y = set_.initial_states(theta)
             np.testing.assert_array_equal(x[i, : y.shape[1]], y[i])
-            expected = pack(set_, y, 0.0, TIMES[None].repeat(2, 0)).members
+            expected = pack(set_, y, 0.0, TIMES[None].repeat(2, 0))[0]
             np.testing.assert_array_equal(packed.parameters[i], expected.parameters[i], err_msg=parameter.name)
             np.testing.assert_array_equal(packed.initial[i], expected.initial[i], err_msg=parameter.name)
             scaled = packed.samples[i] * packed.factor, expected.samples[i] * expected.factor

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.forward import (
     Alternative,
@@ -35,7 +34,7 @@ from en4dvar.model.forward import (
     ValidityLimit,
     initial_states,
 )
-from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.model.state import Array, Field, Indices, Mask, Parameter, StateLayout
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 
@@ -76,22 +75,18 @@ class RandomWalk:
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
-        """Priors of the quantities that join the control vector."""
         return (*([self.spread] if self.spread else []), *self.changes)
 
     @property
     def parameter(self) -> Parameter:
-        """The parameter that varies."""
         return self.first.parameter
 
     @property
     def name(self) -> str:
-        """Name of the parameter."""
         return self.parameter.name
 
     @property
     def label(self) -> str:
-        """The varying quantity in words."""
         return self.parameter.label
 
     @property
@@ -146,17 +141,14 @@ class StateChanges:
 
     @property
     def name(self) -> str:
-        """Name of the field that varies."""
         return self.field.name
 
     @property
     def label(self) -> str:
-        """The varying quantity in words."""
         return f"{self.name} of the state"
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
-        """Priors of the quantities that join the control vector."""
         return self.changes
 
     @property
@@ -168,7 +160,7 @@ class StateChanges:
         """Changes (N, m) from those of the control vector, (N,) by name."""
         return np.stack([theta[term.parameter.name] for term in self.changes], axis=-1)
 
-    def applied(self, model: ForwardModel, x: Array, change: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def applied(self, model: ForwardModel, x: Array, change: Array) -> tuple[Array, Mask]:
         """The states ``x`` (N, n_state) after a ``change`` (N,), and which members (N,) stay inside the bounds."""
         low, high = self.field.bounds
         if self.relative:
@@ -212,7 +204,7 @@ ATTRIBUTES = (
 )  # fmt: skip
 
 Outcomes = Sequence[Trajectory | Failure]
-Part = tuple[Trajectory, npt.NDArray[np.bool_]]
+Part = tuple[Trajectory, Mask]
 Varying = RandomWalk | StateChanges
 
 
@@ -237,11 +229,11 @@ class Walk:
     failures: dict[int, Failure] = field(default_factory=dict)
 
     @property
-    def alive(self) -> npt.NDArray[np.intp]:
+    def alive(self) -> Indices:
         """The members (N',) that have not failed."""
         return np.array([i for i in range(len(self.x)) if i not in self.failures], dtype=np.intp)
 
-    def run(self, begin: float, end: float, integrate: Callable[[npt.NDArray[np.intp], Array], Outcomes]) -> Array:
+    def run(self, begin: float, end: float, integrate: Callable[[Indices, Array], Outcomes]) -> Array:
         """The states (N'', n_state) at ``end`` of the members that survive the piece from ``begin`` to there.
         ``integrate`` runs members (N',) to the instants (N', C + 1) that it is given; no further than to their last.
         """
@@ -261,7 +253,6 @@ class Walk:
         return np.array([path.states[-1] for path in outcomes if isinstance(path, Trajectory)])
 
     def outcomes(self) -> Outcomes:
-        """The whole paths."""
         return [
             self.failures.get(i) or JoinedTrajectory(times, x, self.layout, self.parts[i])
             for i, (times, x) in enumerate(zip(self.times, self.x, strict=True))
@@ -283,16 +274,13 @@ class JoinedTrajectory(Trajectory):
         return self._joined(lambda path: path[name])
 
     def largest(self, name: str) -> float:
-        """The largest of all pieces."""
         return max(path.largest(name) for path, _ in self._parts)
 
     def beyond(self, limit: ValidityLimit) -> float:
-        """The earliest of all pieces."""
         return min(path.beyond(limit) for path, _ in self._parts)
 
     @property
     def states(self) -> Array:
-        """(K, n_state)."""
         inner = self._joined(lambda path: path.states)
         return np.hstack([inner, self._constant(self._x[inner.shape[1] :])])
 
@@ -321,7 +309,6 @@ class PiecewiseModel(ForwardModel):
 
     @property
     def unforeseen(self) -> Mapping[str, float]:  # type: ignore[override]
-        """The same as of the model."""
         return self.model.unforeseen
 
     @property
@@ -342,7 +329,6 @@ class PiecewiseModel(ForwardModel):
         return np.hstack([inner, *(change.values(theta) for change in self.varying)])
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
-        """As of the model."""
         inner = self.model.layout.size
         return np.hstack([self.model.changed(name, x[:, :inner], change), x[:, inner:]])
 
@@ -367,7 +353,7 @@ class PiecewiseModel(ForwardModel):
                 inner[:, self.model.layout[change.name]] = x[:, [self.layout[change.own.name].start + piece]]
             since = np.maximum(start, begin)
 
-            def integrate(members: npt.NDArray[np.intp], asked: Array, since: Array = since) -> Outcomes:
+            def integrate(members: Indices, asked: Array, since: Array = since) -> Outcomes:
                 return self.model.resumed(inner[members], since[members], asked)
 
             ends = walk.run(begin, end, integrate)
@@ -375,7 +361,7 @@ class PiecewiseModel(ForwardModel):
             self._change(walk, inner, end, start <= end)
         return walk.outcomes()
 
-    def _change(self, walk: Walk, inner: Array, knot: float, concerned: npt.NDArray[np.bool_]) -> None:
+    def _change(self, walk: Walk, inner: Array, knot: float, concerned: Mask) -> None:
         """Change the states (N, n_state) at a knot, of the members (N,) ``concerned``; some may not survive it."""
         for process in self.state_changes:
             if knot not in process.knots:

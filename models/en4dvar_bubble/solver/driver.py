@@ -117,7 +117,6 @@ class System:
 
     @cached_property
     def general(self) -> bool:
-        """Whether the general equations are needed."""
         options = self.vapour, self.medium, self.memory, self.shear, self.strain, self.image
         return any(options) or RADIALS[self.radial] != rows.PRESSURE
 
