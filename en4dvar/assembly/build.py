@@ -166,6 +166,21 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     }
 
 
+def needed_file(config: Config, times: object) -> dict[str, DataFile]:
+    """The first data set, by its name, where times (None) or values of parameters come from it; else none.
+
+    Raises :class:`ConfigError`: a value needs a file that is not there. :class:`DataError` as :func:`data_files` does.
+    """
+    asking = [entry.parameter.name for entry in config.parameters if entry.needs_data]
+    if config.data is None or (times is not None and not asking):
+        return {}
+    name, file = next(iter(data_files(config.data).items()))
+    if asking and not file.path.exists():
+        words = f"takes a value from the data, and {file.path} is not there; for an experiment to come, give a quantity"
+        raise ConfigError([config.document.fault(("parameters", asked), words) for asked in asking])
+    return {name: file}
+
+
 def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     data = series.data
     with retold(DataError, DataError, "", series.name):

@@ -127,15 +127,15 @@ def _prominence(text: Any, context: Context) -> float:
 
 
 class WindowSection(Section):
-    """First and last observation used (the assimilation window): ``top``, ``trough 2``, ``maximum``, ``minimum 2``, a
-    time, or ``start``/``end`` of the file; default: all."""
+    """First and last observation used (the assimilation window): ``top``, ``trough 2``, ``maximum``, ``minimum 2``,
+    ``20 % of maximum``, a time, or ``start``/``end`` of the file; default: all."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
     """First observation: start, top, maximum (also written x_max), trough N, minimum N, or a time on the
     file's clock."""
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
-    """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), trough N or end
-    (that of files with fewer), or a time on the file's clock."""
+    """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), 20 % of maximum (the
+    last one before the fall below it), trough N or end (that of files with fewer), or a time on the file's clock."""
     until: Annotated[Instant, Made(_instant)] = Field("end", validate_default=True)
     """Last reading after the window that is predicted; later ones are no longer of the same system."""
     prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ BY_CHANCE = 1e-6  # chance that two recordings of a campaign agree, below which 
 CLOSE = 1e-4  # standard deviations: readings that differ by what a shorter way to write them leaves out
 ROUNDING = 1e-8  # of the largest reading
 ALIKE = 1e-3  # chance of another number of a row of a table to agree
+TELL_SCALE = 4  # readings
 SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
 
 
@@ -225,52 +226,74 @@ class Observations:
 
 
 def require_distinct(sets: Sequence[Observations]) -> None:
-    """Refuse data sets that count together and of which two hold one recording, whole or in part, on the same clock.
+    """Refuse data sets that count together and of which some hold one recording, whole or in part, on the same clock.
 
-    They do where most readings at instants that both have are closer to each other than independent errors, of the
-    stated size and read on the same scale, bring any two of the sets with a chance of :data:`BY_CHANCE`; scalars help
-    where all of them agree. Bounds, readings without weight and several series are not compared.
+    They do where most readings at instants that both have, up to half of a step between readings, are closer to each
+    other than independent errors, of the stated size and read on the coarser of the two scales, bring any two of the
+    sets with a chance of :data:`BY_CHANCE`; scalars help where all of them agree. Bounds, readings without weight and
+    several series are not compared.
 
-    Raises :class:`ConfigError`.
+    Raises :class:`ConfigError`, which names all of them.
     """
-    each, pairs = [{} if o.parts else _readings(o) for o in sets], math.comb(len(sets), 2)
-    width = 2.5 * CLOSE * max((std for own in each for _, std in own.values()), default=1.0)
-    holders: dict[tuple[str, int], list[int]] = {}
+    each, pairs = [_Recording.of(o) for o in sets], math.comb(len(sets), 2)
+    usual = [max(recording.scale, 2.5 * CLOSE * recording.std.max(initial=0.0)) for recording in each]
+    width, step = (max([it for it in its if it < math.inf], default=1.0) for its in (usual, [r.step for r in each]))
+    first, holders = list(range(len(sets))), dict[tuple[int, int], set[int]]()
+    instants = [{round(time / step) for time in recording.times.tolist()} for recording in each]
     for e, own in enumerate(each):
-        cells = [(time, round(value / width)) for time, (value, _) in own.items()]
-        met = Counter(i for time, cell in cells for at in (-1, 0, 1) for i in holders.get((time, cell + at), ()))
-        for i in (i for i, count in sorted(met.items()) if 2 * count > len(own.keys() & each[i].keys())):
+        cells = [(round(t / step), round(value / width)) for t, value in np.stack(own[:2], axis=1).tolist()]
+        about = ([(t + i, v + j) for i in (-1, 0, 1) for j in (-1, 0, 1)] for t, v in cells)
+        met = Counter(i for near in about for i in set[int]().union(*(holders.get(cell, ()) for cell in near)))
+        for i in (i for i, count in sorted(met.items()) if 2 * count > len(instants[e] & instants[i])):
             numbers = {*sets[e].scalars.values()} if sets[i].scalars == sets[e].scalars else set()
-            if pairs * _chance(own, each[i]) * ALIKE ** len(numbers) < BY_CHANCE:
-                a, b = (f"{o.name} ({o.source})" if o.source else o.name for o in (sets[i], sets[e]))
-                raise ConfigError(
-                    f"{a} and {b} hold the same readings, which would count twice: give one of them alone; what two "
-                    "configurations say of one recording is told by 'en4dvar compare'"
-                )
+            if first[i] == i and pairs * own.chance(each[i]) * ALIKE ** len(numbers) < BY_CHANCE:
+                first[e] = i
+                break
         for held in cells:
-            holders.setdefault(held, []).append(e)
+            holders.setdefault(held, set()).add(e)
+    named = [f"{o.name} ({o.source})" if o.source else o.name for o in sets]
+    groups = [[named[e] for e in range(len(sets)) if first[e] == i] for i in dict.fromkeys(first)]
+    if copies := [f"{', '.join(group[:-1])} and {group[-1]}" for group in groups if len(group) > 1]:
+        raise ConfigError(
+            f"{'; '.join(copies)} hold the same readings, which would count more than once: give each recording once; "
+            "what two configurations say of one recording is told by 'en4dvar compare'"
+        )
 
 
-def _readings(observations: Observations) -> dict[str, tuple[float, float]]:
-    """Time, to nine digits, → value and std."""
-    used = observations.used
-    of = (observations.times, observations.values, observations.noise.std)
-    return {f"{time:.9g}": (value, std) for time, value, std in zip(*(it[used].tolist() for it in of), strict=True)}
+class _Recording(NamedTuple):
+    """Readings (K,) that count, on the clock of the data, the scale that they are read on, 0 where they are too few to
+    tell it, and the step between them."""
 
+    times: Array
+    values: Array
+    std: Array
+    scale: float
+    step: float
 
-def _chance(own: Mapping[str, tuple[float, float]], other: Mapping[str, tuple[float, float]]) -> float:
-    """The chance that independent readings of two recordings agree as often as these do."""
-    common = own.keys() & other.keys()
-    values, stds = np.array([[own[t], other[t]] for t in sorted(common)]).transpose(2, 1, 0)
-    apart, std = np.abs(values[0] - values[1]), np.sqrt(np.mean(stds**2, axis=0))
-    scale = _scale(values.ravel())
-    likely = 1.0
-    for near in (np.full(len(common), 0.5 * scale), np.maximum(0.5 * scale, CLOSE * std)):
-        alike = int(np.sum(apart <= near))
-        of_each = float(np.mean(special.erf(np.maximum(scale, near) / (2 * std))))
-        if 2 * alike > len(common):
-            likely = min(likely, float(special.bdtrc(alike - 1, len(common), of_each)))
-    return likely
+    @classmethod
+    def of(cls, observations: Observations) -> Self:
+        used = np.empty(0, dtype=int) if observations.parts else observations.used
+        times, values = observations.file_times[used], observations.values[used]
+        step = float(np.median(np.diff(times))) if len(times) > 1 else math.inf
+        return cls(times, values, observations.std[used], _scale(values) if len(values) >= TELL_SCALE else 0.0, step)
+
+    def chance(self, other: "_Recording") -> float:
+        """The chance that independent readings of two recordings agree as often as these do."""
+        few, many = (self, other) if len(self.times) < len(other.times) else (other, self)
+        at = np.searchsorted(0.5 * (many.times[1:] + many.times[:-1]), few.times)
+        step = min(few.step, many.step)
+        near_in_time = 0.5 * step if step < math.inf else SAME_TIME * np.abs(few.times)
+        common = np.abs(few.times - many.times[at]) <= near_in_time
+        apart, var = np.abs(few.values - many.values[at])[common], (few.std**2 + many.std[at] ** 2)[common]
+        scale, likely = max(few.scale, many.scale) or _scale(np.concatenate([few.values, many.values])), 1.0
+        for least in (CLOSE, 0.0):  # of the errors
+            near = np.maximum((0.5 + ROUNDING) * scale, least * np.sqrt(var / 2))
+            alike, count = int(np.count_nonzero(apart <= near)), len(apart)
+            if 2 * alike <= count:
+                break
+            of_each = float(np.mean(special.erf(np.maximum(scale, near) / np.sqrt(2 * var))))
+            likely = min(likely, float(special.bdtrc(alike - 1, count, of_each)))
+        return likely
 
 
 def _scale(values: Array) -> float:
@@ -280,7 +303,8 @@ def _scale(values: Array) -> float:
         step, rest = max(step, float(value)), min(step, float(value))
         while rest > least:
             step, rest = rest, min(step % rest, rest - step % rest)
-    return step or math.inf
+        step = value / round(value / step) if value else step  # the errors of remainders would grow from value to value
+    return float(step) or math.inf
 
 
 def _same_instants(times: Sequence[Array]) -> list[Array]:

@@ -8,12 +8,15 @@ known sign: it was chosen for its value, and those beside it were left out for t
 same instants by what no single sample decides: the vertex of a parabola through the samples about the maximum, and the
 middle between the two crossings of half the depth of a minimum, seen between the minima beside it.
 
-An instant may be followed by another for series that have no such minimum: ``trough 2 or end``.
+``20 % of maximum`` is where a series has fallen to that share of its largest sample: a window begins with the first
+sample below it and ends with the last one before.
+
+An instant may be followed by another for series that have no such minimum, or do not fall as far: ``trough 2 or end``.
 """
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -25,6 +28,7 @@ from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
 _NUMBERED = re.compile(r"(minimum|trough)(?:\s+(\d+))?")
+_SHARE = re.compile(r"(\S+\s*%)\s+of\s+(?:the\s+)?(\S+)")
 ABOUT = 0.8  # of the maximum: the samples that are larger tell where the top is
 
 
@@ -32,39 +36,48 @@ ABOUT = 0.8  # of the maximum: the samples that are larger tell where the top is
 class Instant:
     """A sample of a series: an end, an extremum (the ``number``-th minimum), or a ``time`` on the file's clock.
 
-    ``top`` and ``trough`` are the maximum and a minimum where several samples, and no single one, put them.
-    ``otherwise`` is what counts where there is no such minimum.
+    ``top`` and ``trough`` are the maximum and a minimum where several samples, and no single one, put them; ``fall`` is
+    where the series has fallen to a ``share`` of its maximum.
+    ``otherwise`` is what counts where there is no such minimum or fall; ``text`` says all of it, as it was written.
     """
 
-    kind: Literal["start", "end", "maximum", "minimum", "top", "trough", "time"]
+    kind: Literal["start", "end", "maximum", "minimum", "top", "trough", "fall", "time"]
     number: int = 1
     time: float = 0.0
+    share: float = 0.0
     otherwise: "Instant | None" = None
+    text: str = field(default="", compare=False)
 
 
-BY_NAME: dict[str, Instant] = {kind: Instant(kind) for kind in ("start", "end", "maximum", "top")}
+BY_NAME: dict[str, Instant] = {kind: Instant(kind, text=kind) for kind in ("start", "end", "maximum", "top")}
 
 
 def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = ()) -> Instant:
     """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``top``, ``minimum 2``, ``trough 2``,
-    ``trough 2 or`` another of these, or a time with its unit.
+    ``20 % of maximum``, the last three with ``or`` and another of these behind them, or a time with its unit.
 
     Raises :class:`UnitError` (a ``ValueError``) for anything else.
     """
     word = str(text).strip()
     if word in BY_NAME:
         return BY_NAME[word]
-    if word.endswith("_max") and word.removesuffix("_max") in symbols:
-        return Instant("maximum")
+    largest = ("maximum", *(f"{symbol}_max" for symbol in symbols))
+    if word in largest:
+        return BY_NAME["maximum"]
     first, *others = re.split(r"\s+or\s+", word, maxsplit=1)
-    numbered = _NUMBERED.fullmatch(first)
-    if numbered and numbered[2] != "0":
-        otherwise = parse_instant(others[0], time_unit, symbols) if others else None
+    instant = None
+    if (numbered := _NUMBERED.fullmatch(first)) and numbered[2] != "0":
         kind: Literal["minimum", "trough"] = "minimum" if numbered[1] == "minimum" else "trough"
-        return Instant(kind, int(numbered[2] or 1), otherwise=otherwise)
+        instant = Instant(kind, int(numbered[2] or 1))
+    elif (said := _SHARE.fullmatch(first)) and said[2] in largest:
+        if not 0 < (share := parse_quantity(said[1], "1")) < 1:
+            raise UnitError(f"{shown(text)}: the share must lie between 0 and 100 %")
+        instant = Instant("fall", share=share)
+    if instant is not None:
+        return replace(instant, otherwise=parse_instant(others[0], time_unit, symbols) if others else None, text=word)
     if word[:1].isdigit() or word[:1] in "+-.":
-        return Instant("time", time=parse_quantity(text, time_unit))
-    kinds = "start, end, maximum, top, 'minimum 2', 'trough 2', 'trough 2 or end', or '3 us'"
+        return Instant("time", time=parse_quantity(text, time_unit), text=word)
+    kinds = "start, end, maximum, top, 'minimum 2', 'trough 2', '20 % of maximum', 'trough 2 or end', or '3 us'"
     raise UnitError(f"{shown(text)} is not an instant: {kinds}")
 
 
@@ -96,14 +109,21 @@ def index_of(
         side: Literal["left", "right"] = "right" if last else "left"
         rounding = 1e-9 * float(np.ptp(times))  # a sample at 3 us may be stored as 3.0000000000000004e-6
         return int(np.searchsorted(times, instant.time + (rounding if last else -rounding), side)) - last
-    if instant.kind == "maximum":
-        return first + int(np.argmax(values[first:]))
     if instant.kind == "top":
         return int(np.searchsorted(times, vertex(times[first:], values[first:])))
-    indices = minima(values[first:], prominence)
+    largest = first + int(np.argmax(values[first:]))
+    if instant.kind == "maximum":
+        return largest
+    falls = instant.kind == "fall"
+    below = np.flatnonzero(values[largest:] < instant.share * values[largest]) + largest - first - last
+    indices = below if falls else minima(values[first:], prominence)
     if instant.number > len(indices):
         if instant.otherwise is not None:
             return index_of(times, values, instant.otherwise, first, prominence, last)
+        if falls:
+            level = f"{100 * instant.share:.3g} % of maximum"
+            elsewhere = f"end it elsewhere ('to: {level} or end', or at a time)"
+            raise DataError(f"asks for {level}, but no reading after the maximum is below that; {elsewhere}")
         few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
         elsewhere = f"'to: {instant.kind} {instant.number} or end', or at a time"
         advice = f"end it elsewhere ({elsewhere}), or lower its prominence"

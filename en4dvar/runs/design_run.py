@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.assembly.build import data_files, discrepancy_terms, inverse_plan, problem_of
+from en4dvar.assembly.build import discrepancy_terms, inverse_plan, needed_file, problem_of
 from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
 from en4dvar.config.design import Value
@@ -117,7 +117,7 @@ class DesignKind(RunKind[Designs]):
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:
-        return files_needed(self.config)
+        return needed_file(self.config, _planned_times(self.config))
 
     @cached_property
     def asked(self) -> Asked:
@@ -305,7 +305,7 @@ def planned_problem(config: Config) -> InverseProblem:
     """
     plan, times = inverse_plan(config), _planned_times(config)
     measured = None
-    for name, file in files_needed(config).items():
+    for name, file in needed_file(config, times).items():
         measured = read_observations(plan, file, name, config.weights)
     if config.weights != "sum":
         raise ConfigError([config.document.fault(("assimilation", "weights"), "only 'weights: sum' is Bayesian")])
@@ -336,15 +336,6 @@ def planned_problem(config: Config) -> InverseProblem:
 
 def _planned_times(config: Config) -> Array | None:
     return config.design.times if config.design.times is not None else config.simulate_times
-
-
-def files_needed(config: Config) -> dict[str, DataFile]:
-    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one. Raises
-    :class:`ConfigError`, :class:`DataError`: there is none.
-    """
-    if _planned_times(config) is not None and not any(entry.needs_data for entry in config.parameters):
-        return {}
-    return dict([next(iter(data_files(inverse_plan(config)).items()))])
 
 
 def _observations(

@@ -9,14 +9,15 @@ even one that noise puts below zero: that would bias the noise, and with it what
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.assembly.build import data_files, resolve_parameters
+from en4dvar.assembly.build import needed_file, resolve_parameters
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
-from en4dvar.config.data import SeriesPlan
+from en4dvar.config.data import DataPlan, SeriesPlan
 from en4dvar.config.kinds import CampaignFile, GroupSection, terms_and_fixed
 from en4dvar.config.load import Read
 from en4dvar.config.parameters import Tied
@@ -83,9 +84,8 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
         _places(series, 1)
     times = config.simulate_times if times is None else times
     observations = None
-    if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        name, file = next(iter(data_files(config.data).items()))
-        observations = read_observations(config.data, file, name)
+    for name, file in needed_file(config, times).items():
+        observations = read_observations(cast(DataPlan, config.data), file, name)
     if times is None:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")

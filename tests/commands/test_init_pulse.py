@@ -63,6 +63,23 @@ def test_a_window_to_the_end_says_why_it_does_not_end_before() -> None:
     assert line.endswith("# all readings: none after the maximum is below 20 % of it")
 
 
+def test_the_window_of_each_bubble_of_a_folder_ends_with_its_own_collapse() -> None:
+    Path("gel").mkdir()
+    times, ends = np.arange(0.0, 40.0, 1.0), {"a": 12.0, "b": 19.0, "c": 31.0}
+    for name, end in ends.items():
+        top = 0.6 * end
+        way = np.where(times < top, (times - top) / (top + 0.1), (times - top) / (end - top))
+        radius = np.where(times < end, 150 * np.clip(1 - way**2, 1e-4, 1) ** 0.4, 6.0)
+        rows = [f"{t:.1f},{r:.3f}" for t, r in zip(times, radius, strict=True)]
+        Path(f"gel/{name}.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    rows = [f"{t:.1f},{60 - (t - 18) ** 2 / 20:.3f}" for t in times[:30]]
+    Path("gel/slow.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    assert call("init", "--data", "gel", "--start", "acoustic").exit_code == 0
+    assert "window: {from: start, to: 20 % of maximum or end}" in Path("gel.yaml").read_text()
+    last = {p.observations.name: 1e6 * p.observations.file_times[-1] for p in build(proposed(Path("gel.yaml")))}
+    assert last == pytest.approx({"a": 11.0, "b": 18.0, "c": 30.0, "slow": 29.0})
+
+
 def test_bubbles_of_one_gel_grow_from_alike_nuclei() -> None:
     """Six bubbles do not tell the nuclei of a gel six times as well as what is known: R0 varies, unless it is seen."""
     Path("gel").mkdir()

@@ -13,11 +13,11 @@ from toys import make_observations
 
 from en4dvar.cli import main
 from en4dvar.data.noise import noise_of
-from en4dvar.data.observations import require_distinct
+from en4dvar.data.observations import _scale, require_distinct
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.runner import run_campaign
 
-TWICE = "hold the same readings, which would count twice: give one of them alone"
+TWICE = "hold the same readings, which would count more than once: give each recording once"
 K = "k: {prior: lognormal, median: 3 N/m, log_std: 0.3}"
 
 
@@ -77,11 +77,42 @@ def test_replicates_on_a_coarse_scale_are_recordings_of_their_own(count, step, s
         require_distinct([make_observations(times, values, std=0.5, name=f"r{i}") for i, values in enumerate(read)])
 
 
+@pytest.mark.parametrize("fewer", [{"times": 2}, {"values": 1}, {"times": 1, "values": 1}])
+def test_a_copy_with_fewer_digits_counts_once(fewer):
+    """Frames of 0.63 us, of which two programs wrote the times and radii with other numbers of digits."""
+    times = 0.63 * np.arange(40.0) + 7.1234
+    values = 60 * np.exp(-times / 20) + np.random.default_rng(3).normal(0, 0.4, 40)
+    first = make_observations(times, values, std=0.4, name="a")
+    digits = {"times": 9, "values": 9, **fewer}
+    copy = make_observations(np.round(times, digits["times"]), np.round(values, digits["values"]), std=0.4, name="b")
+    for sets in ([first, copy], [copy, first], [replace(first, times=times - 7.1, zero=7.1), copy]):
+        with pytest.raises(ConfigError, match=rf"^{sets[0].name} and {sets[1].name} {TWICE}"):
+            require_distinct(sets)
+    again = make_observations(times, values + np.random.default_rng(4).normal(0, 0.4, 40), std=0.4, name="b")
+    require_distinct([first, replace(again, values=np.round(again.values, 1))])
+
+
+def test_all_copies_are_named():
+    many = [recording(name, seed=seed) for name, seed in (("a", 0), ("b", 1), ("c", 0), ("d", 2), ("e", 1), ("f", 0))]
+    words = r"^a \(a.csv\), c \(c.csv\) and f \(f.csv\); b \(b.csv\) and e \(e.csv\) "
+    with pytest.raises(ConfigError, match=words + TWICE):
+        require_distinct(many)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 0.1, 1e-4, 3e-7])
+def test_the_scale_of_readings(scale):
+    counts = np.random.default_rng(1).integers(1, 90_000, 40)
+    assert _scale(scale * counts * 1e-6) == pytest.approx(scale * 1e-6, rel=1e-9)
+    assert _scale(recording().values) == pytest.approx(1e-4, rel=1e-9)
+    assert _scale(np.zeros(3)) == np.inf
+
+
 def test_rows_of_a_table_are_told_apart_by_their_other_columns():
     """Bubbles of which one time each is read."""
     row = {"R_max": 0.2, "R_eq": 0.03, "tilt": 7.0}
     a, b = (recording(name, slice(3, 4), scalars=row) for name in "ab")
     require_distinct([a, replace(b, scalars={**row, "R_max": 0.21})])
+    require_distinct([a, replace(b, values=1.05 * a.values)])
     with pytest.raises(ConfigError, match=TWICE):
         require_distinct([a, b])
 

@@ -385,3 +385,13 @@ def test_what_each_reading_says_of_itself_cannot_be_planned(more, what, tmp_path
     plan = _plan()
     with pytest.raises(ConfigError, match=f"{what} cannot be planned at design.times; leave design.times out"):
         run_design(plan | {"data": plan["data"] | more}, out=tmp_path / "designs")
+
+
+@pytest.mark.parametrize("command", [["design"], ["simulate", "--times", "0 us:10 us:1 us"]])
+def test_a_prior_that_is_a_share_of_readings_yet_to_come_is_told_where_it_stands(command, tmp_path):
+    share = "parameters.R_eq.median=12 % of maximum"
+    plan = str(TESTS.parent / "configs" / "laser_design.yaml")
+    done = CliRunner().invoke(main, [*command, plan, "--set", share, "--out", str(tmp_path / "x")])
+    assert done.exit_code == 2
+    assert "parameters.R_eq: takes a value from the data, and" in done.output
+    assert "planned.csv is not there; for an experiment to come, give a quantity" in done.output

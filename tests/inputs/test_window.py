@@ -37,6 +37,21 @@ def test_what_ends_a_series_without_such_a_minimum() -> None:
             parse_instant(text, "s")
 
 
+def test_a_fall_to_a_share_of_the_maximum() -> None:
+    above, below = (float(T[i]) for i in (31, 32))
+    assert BOUNCES[31] > 0.8 * BOUNCES.max() > BOUNCES[32]
+    assert cut(BOUNCES, "maximum", "80 % of maximum")[1] == above
+    assert cut(BOUNCES, "80 % of R_max", "end")[0] == below
+    assert cut(3 * BOUNCES, "start", "80 % of the maximum or end") == (0.0, above)
+    assert cut(BOUNCES, "start", "20 % of maximum or minimum 2") == (0.0, 2.0)
+    assert cut(np.sort(BOUNCES), "start", "80% of maximum or end") == (0.0, 4.0)
+    with pytest.raises(DataError, match=r"asks for 20 % of maximum, but no reading .*'to: 20 % of maximum or end'"):
+        cut(BOUNCES, "start", "20 % of maximum")
+    for text in ("0 % of maximum", "100 % of maximum", "20 kPa% of maximum", "20 % of minimum", "20 % of R_max"):
+        with pytest.raises(UnitError, match=r"share must lie between|is not an instant|unit"):
+            parse_instant(text, "s")
+
+
 def test_top_and_trough() -> None:
     triangles = np.abs((T - 0.52) % 1.0 - 0.5)  # minima at 1.02, 2.02, 3.02: between two samples
     assert cut(triangles, "minimum 2", "trough 1") == pytest.approx((2.025, 3.0))

@@ -65,8 +65,7 @@ class Source:
         told = {part.name: getattr(self.layout, part.name) for part in fields(Layout) if part.name != "since"}
         lines = [f"  {name}: {quoted(it)}" for name, it in told.items() if it is not None and it != getattr(ANY, name)]
         since = self.layout.since
-        when = {"time": f"{1e6 * since.time:.9g} us", "maximum": "maximum", "top": "top", "end": "end"}
-        return lines + [f"  since: {when.get(since.kind, f'{since.kind} {since.number}')}"] * (since != ANY.since)
+        return lines + [f"  since: {since.text}"] * (since != ANY.since)
 
 
 # the table that 'en4dvar track' writes: its columns say their units
@@ -150,7 +149,7 @@ def propose_config(
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
     known(medium)
-    if layout.since.kind in ("minimum", "trough"):
+    if layout.since.kind in ("minimum", "trough", "fall"):
         start = start or "laser"  # behind a collapse a bubble is released from its maximum
     source = Source(path_from(Path(folder), str(data)), time, time_step, radius, layout, errors, step_unit, rate)
     files = with_parts(

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from en4dvar.inputs.parts import ANY, VARIABLES, DataFile, Layout, cell, opened, table_of
 from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines, sheet_lines
@@ -41,6 +42,25 @@ class Grouped:
             alone = all(begins.pop(group)) and not any(map(any, begins.values()))
             told[_json(group)] = _json(f"{glob.escape(group)}_*" if alone else [*map(glob.escape, names)])
         return told
+
+
+class Together(NamedTuple):
+    """Of several bubbles: the ``names`` of the parameters that vary from one to the other of one gel or ``liquid``, and
+    the ``common`` ones. How much bubbles of one gel differ is known better than the gel itself.
+    """
+
+    names: Sequence[str]
+    common: Sequence[str]
+    liquid: bool
+    groups: Grouped
+
+
+def ends_with(kind: str, sizes: Mapping[str, int]) -> str:
+    """What the run estimates at its end of groups of a kind and their numbers of bubbles; of one gel without groups."""
+    if not sizes:
+        return "at its end the run estimates their one gel"
+    told = ", ".join(f"{name} ({count})" for name, count in sizes.items())
+    return f"at its end the run estimates each {kind}, and compares them: {told}"
 
 
 def _json(value: object) -> str:

@@ -162,8 +162,8 @@ class Look:
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
     ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
-    ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
-    descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
+    ``begin`` is the first instant, ``step`` the median time between samples; ``falls`` tells whether the radius falls
+    below :data:`COLLAPSED` of its maximum. ``n_minima`` follow the maximum with a ``prominence`` relative to the
     range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
     or has a ``hole`` there, told in words, so that the time of the collapse is where a fit goes on to. ``reason`` says
     in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
@@ -180,7 +180,7 @@ class Look:
     before: tuple[float, float]
     n_minima: int
     prominence: float
-    descent: float
+    falls: bool
     short: bool
     early: bool
     hole: str
@@ -216,7 +216,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"the first {begins} readings are small beside the bubble, which appears at {when}: ultrasound makes it "
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
-    step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
+    step, falls = float(np.median(np.diff(times))), bool(radius[largest:].min() < COLLAPSED * radius[largest])
     noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
     early, hole = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c), ""
     if seen < len(times) and chosen == "laser":
@@ -224,7 +224,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses"
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
-        n_minima, prominence, descent, chosen == "laser" and not hole and (early or single(times, radius)), early,
+        n_minima, prominence, falls, chosen == "laser" and not hole and (early or single(times, radius)), early,
         hole, chosen, reason, clear,
     )  # fmt: skip
 
@@ -367,13 +367,6 @@ def _rest(times: Array, radius: Array, peak: Lobe) -> tuple[float, str]:
     return rest, ""
 
 
-def _end_of_descent(times: Array, radius: Array) -> float:
-    """The last sample before the radius falls below 20 % of its maximum; NaN where none is below."""
-    top = int(np.argmax(radius))
-    below = np.flatnonzero(radius[top:] < COLLAPSED * radius[top])
-    return float(times[top + below[0] - 1]) if len(below) else float("nan")
-
-
 def second_maximum(radius: Array) -> float:
     """The largest radius between the first two collapses over the maximum; NaN where there is no rebound."""
     top = int(np.argmax(radius))
@@ -437,6 +430,5 @@ def typical_look(views: Sequence[Look]) -> Look:
         rest=R_max * typical([v.rest / v.lobe.R_max for v in views]),
         drift=next((v.drift for v in views if v.drift), ""),
         before=(typical([v.before[0] for v in views]), typical([v.before[1] for v in views])),
-        descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
         early=all(v.early for v in views),
     )

@@ -22,9 +22,19 @@ from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
-from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
+from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped, Together, ends_with
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import TOP_WIDTH, Look, Start, at_rest, look, typical_look, usable, without_rebound
+from en4dvar_bubble.starter.look import (
+    COLLAPSED,
+    TOP_WIDTH,
+    Look,
+    Start,
+    at_rest,
+    look,
+    typical_look,
+    usable,
+    without_rebound,
+)
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -60,17 +70,6 @@ COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebo
 EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
-
-
-class Together(NamedTuple):
-    """Of several bubbles: the ``names`` of the parameters that vary from one to the other of one gel or ``liquid``, and
-    the ``common`` ones. How much bubbles of one gel differ is known better than the gel itself.
-    """
-
-    names: Sequence[str]
-    common: Sequence[str]
-    liquid: bool
-    groups: Grouped
 
 
 @dataclass(frozen=True)
@@ -174,20 +173,13 @@ def propose(
         (*_model(law_name, model, look), *wall[:1]),
         lines,
         SIMPLER[chosen],
-        (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
+        (*told, *[f"{len(views)} bubbles: {ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
         together,
         _end(views, 3) if in_a_gel and np.median([v.n_minima for v in views]) > 2 else "",
         tuple(looks),
         (*Proposal.assimilation, *[Entry("what_if", "false", EACH_ALONE)] * bool(together)),
     )
-
-
-def _ends_with(kind: str, sizes: Mapping[str, int]) -> str:
-    if not sizes:
-        return "at its end the run estimates their one gel"
-    told = ", ".join(f"{name} ({count})" for name, count in sizes.items())
-    return f"at its end the run estimates each {kind}, and compares them: {told}"
 
 
 def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
@@ -288,10 +280,11 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
             Entry("time_zero", "top", "the model's clock starts at the top, shifted by t_s"),
         ]
     else:
-        end, words = "end", "all readings: none after the maximum is below 20 % of it"
-        if np.isfinite(look.descent):
-            end = f"{convert(look.descent, 's', 'us'):.9g} us"
-            words = "growth and collapse down to 20 % of R_max; then the wall is too fast for the model"
+        level = f"{100 * COLLAPSED:g} % of maximum"
+        end, words = "end", f"all readings: none after the maximum is below {level.replace('maximum', 'it')}"
+        if any(view.falls for view in views):
+            end = level + " or end" * (not all(view.falls for view in views))
+            words = "growth and collapse down to this share; then the wall is too fast for the model"
         lines = [Entry("window", f"{{from: start, to: {end}}}", words), _clock(look, model, theta)]
     std, words = "1 % of maximum", "too few readings to show their scatter: enter what you know of your camera"
     if np.isfinite(look.noise):
