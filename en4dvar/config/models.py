@@ -188,14 +188,18 @@ def model_listing() -> str:
     """Every registered model, built with its default settings: observables and parameters with units. A model that
     cannot be loaded or whose settings have no defaults is listed with the reason.
     """
-    return "\n\n".join(map(_description, installed(GROUP)))
+    return "\n\n".join(map(_listed, installed(GROUP)))
+
+
+def _listed(name: str) -> str:
+    try:
+        return _description(name)
+    except (En4dvarError, ValueError) as error:  # of one package; the others are listed
+        return f"{name}: {error}"
 
 
 def _description(name: str) -> str:
-    try:
-        kind: Any = find_model(name)
-    except En4dvarError as error:
-        return f"{name}: {error}"
+    kind: Any = find_model(name)
     title = (kind.__doc__ or "").strip().split("\n", 1)[0]
     settings = settings_of(kind)
     needed = [field for field, info in settings.model_fields.items() if info.is_required()]

@@ -19,8 +19,12 @@ TransformName = Literal[
 ]
 
 
-def floats(values: npt.ArrayLike) -> Array:
-    """As an array of float64: NaN where an array of :mod:`numpy.ma` is masked."""
+def floats(values: npt.ArrayLike, whose: str = "") -> Array:
+    """As an array of float64: NaN where an array of :mod:`numpy.ma` is masked. Raises TypeError, which begins with
+    ``whose`` they are, for complex numbers, and TypeError or ValueError for what is no numbers.
+    """
+    if np.iscomplexobj(values):
+        raise TypeError(f"{whose}complex numbers; give real ones")
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(float), np.nan)
     return np.asarray(values, dtype=float)
@@ -31,9 +35,7 @@ def hold_floats(whole: object, *keys: str) -> None:
     for what is no real numbers.
     """
     for key in keys:
-        if np.iscomplexobj(value := getattr(whole, key)):
-            raise TypeError(f"{key}: complex numbers")
-        object.__setattr__(whole, key, floats(value))
+        object.__setattr__(whole, key, floats(getattr(whole, key), f"{key}: "))
 
 
 class Shown:

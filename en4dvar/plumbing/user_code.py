@@ -36,6 +36,10 @@ class EndedError(En4dvarError):
     """Code of a user wanted to end the program, or raised what is no :class:`Exception`."""
 
 
+class ReturnedError(En4dvarError):
+    """Code of a user returned what cannot be used: which, what came, what is expected."""
+
+
 class RefusedError(En4dvarError):
     """Code that may not be loaded; see :func:`permission`."""
 
@@ -68,7 +72,7 @@ def own_fault(error: BaseException) -> Exception:
 def reason_of(error: BaseException) -> str:
     """:func:`describe` of :func:`own_fault`: the reason why a member is lost."""
     fault = own_fault(error)
-    return str(fault) if isinstance(fault, EndedError) else describe(fault)
+    return str(fault) if isinstance(fault, EndedError | ReturnedError) else describe(fault)
 
 
 def in_worker() -> None:
