@@ -17,7 +17,8 @@ from en4dvar.executor import Outcome
 from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, gives_rate, initial_states, read_along
 from en4dvar.model.state import Array, Field, Indices, floats
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.user_code import own_fault, reason_of
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.user_code import ReturnedError, line_of, own_fault, reason_of
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
 
@@ -76,7 +77,13 @@ class InitialStates:
         theta = {name: physical[:, j].copy() for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
-        states = floats(initial_states(self.problem.model, theta, len(physical)), "initial_states returned ")
+        try:
+            states = floats(initial_states(self.problem.model, theta, len(physical)), "initial_states")
+        except KeyError as error:
+            if (name := str(error.args[0])) in theta:
+                raise
+            words = f"initial_state asks for a parameter {name!r}{suggest(name, theta)}{line_of(error)}"
+            raise ReturnedError(words) from None
         if states.shape != (len(physical), self.size):
             raise ValueError(f"misshapen initial state: {states.shape}, not {(len(physical), self.size)}")
         if self.perturbed or self.problem.fields:

@@ -330,7 +330,7 @@ class ForwardModel(ABC):
         """State vectors (N, n_state) of N members, parameters as name → (N,). This default repeats the above."""
         n_members = len(next(iter(theta.values())))
         each = ({k: float(v[i]) for k, v in theta.items()} for i in range(n_members))
-        return np.stack([floats(self.initial_state(own), "initial_state returned ") for own in each])
+        return np.stack([floats(self.initial_state(own), "initial_state") for own in each])
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
@@ -399,7 +399,7 @@ class ForwardModel(ABC):
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:
-                    x = floats(self.step(x, t, float(t_next)), "step returned ")
+                    x = floats(self.step(x, t, float(t_next)), "step")
                 except BaseException as error:  # a model may fail in any way; the reason is kept
                     return Failure(reason_of(error), t)
                 t = float(t_next)

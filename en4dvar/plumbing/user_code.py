@@ -98,9 +98,10 @@ def loading(what: str) -> Iterator[None]:
 
 
 def line_of(error: BaseException) -> str:
-    """The last line of the user's that the error went through; "" where it reached none."""
+    """The last line of the user's that the error went through, if there is one outside of installed packages, or ""."""
     files = [(f.filename, f.lineno) for f in traceback.extract_tb(error.__traceback__)]
     own = [(name, line) for name, line in files if not name.startswith(("<", *_NOT_THE_USERS))]
+    own = [(name, line) for name, line in own if not is_installed(Path(name).resolve())] or own
     return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
 
 

@@ -163,7 +163,7 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
 def _path(model: ForwardModel, theta: Mapping[str, float], times: Array) -> Trajectory:
     """At times on the model's clock. Raises :class:`En4dvarError` where the model fails."""
     try:
-        state = floats(model.initial_state(theta), "initial_state returned ")
+        state = floats(model.initial_state(theta), "initial_state")
     except BaseException as error:
         reason = error if isinstance(error, ValueError) else reason_of(error)
         raise En4dvarError(f"the model refuses its parameters: {reason}") from None

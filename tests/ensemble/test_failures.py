@@ -140,7 +140,7 @@ def test_complex_states_are_told_and_not_cut_to_their_real_parts(method, monkeyp
     monkeypatch.setattr(Linear, "step", lambda self, x, t0, t1: x, raising=False)
     monkeypatch.setattr(Linear, method, lambda self, *asked: np.full(4, 1j))
     (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
-    assert f"{method} returned complex numbers; give real ones" in reason
+    assert f"{method}: complex numbers; give real ones" in reason
 
 
 def test_an_initial_state_of_a_wrong_shape_is_told_with_both_shapes(monkeypatch):
