@@ -156,7 +156,9 @@ def warm_up() -> None:
 
 def examples() -> Iterator[tuple[str, Callable[[], object]]]:
     """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
-    for name, entry in installed(WARM_UP).items():
+    declared = [rival for entry in installed(WARM_UP).values() for rival in getattr(entry, "rivals", (entry,))]
+    for entry in declared:
+        name = entry.name
         calls = loaded(entry, f"warm-up of {name!r}")()
         if not isinstance(calls, Mapping):
             raise En4dvarError(f"warm-up of {name!r}: {entry.value} must return a dict of calls, not {calls!r}")

@@ -9,6 +9,7 @@ further kinds of files (group ``en4dvar.schemas``: the key that marks the kind â
 import json
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
@@ -19,8 +20,9 @@ from en4dvar.config.load import Estimation
 from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
 from en4dvar.model.state import OF_READINGS, Parameter
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.installed import installed
+from en4dvar.plumbing.user_code import loading
 
 Json = dict[str, Any]
 KINDS = "en4dvar.schemas"
@@ -48,8 +50,9 @@ def json_schema() -> Json:
         ]  # fmt: skip
     kinds = {name: name for name in marked}
     for name, entry in installed(KINDS).items():
-        definitions[f"{name}_file"] = _of(entry.load().model_json_schema())
-        kinds[name] = f"{name}_file"
+        with suppress(ConfigError), loading(f"schema {name!r}"):  # another package's may not end the command
+            definitions[f"{name}_file"] = _of(entry.load().model_json_schema())
+            kinds[name] = f"{name}_file"
     chosen: Json = {"$ref": "#/$defs/estimation"}
     for key, name in reversed(kinds.items()):
         chosen = {**_if({"required": [key]}, {"$ref": f"#/$defs/{name}"}), "else": chosen}

@@ -4,6 +4,8 @@ Its labels and symbols are tried before any work: matplotlib reads them when eve
 """
 
 import re
+from collections.abc import Mapping
+from inspect import getattr_static
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,8 @@ from pydantic import BaseModel, ConfigDict
 
 from en4dvar.config.context import check
 from en4dvar.config.document import Document
-from en4dvar.model.forward import ForwardModel, StateField
-from en4dvar.model.state import OF_READINGS, Parameter
+from en4dvar.model.forward import Alternative, ForwardModel, Observable, PathQuantity, StateField, ValidityLimit
+from en4dvar.model.state import OF_READINGS, Parameter, StateLayout
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault, retold
 from en4dvar.plumbing.files import PathError
@@ -86,10 +88,21 @@ def find_model(name: str) -> type[ForwardModel]:
         raise ConfigError(f"model {shown(name)} cannot be loaded: {error}") from error
     if not (isinstance(model, type) and issubclass(model, ForwardModel)):
         raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
-    if hasattr(model, "Settings") != hasattr(model, "from_settings"):
-        lacking = "from_settings" if hasattr(model, "Settings") else "Settings"
-        raise ConfigError(f"{name!r} cannot come from YAML: Settings and from_settings go together, it lacks {lacking}")
+    _require_buildable(model, name)
     return model
+
+
+def _require_buildable(kind: Any, name: str) -> None:
+    """Raise :class:`ConfigError` where a class with settings cannot be made of them."""
+    why, settings = f"{name!r} cannot come from YAML", getattr(kind, "Settings", NoSettings)
+    if hasattr(kind, "Settings") != hasattr(kind, "from_settings"):
+        lacking = "from_settings" if hasattr(kind, "Settings") else "Settings"
+        raise ConfigError(f"{why}: Settings and from_settings go together, it lacks {lacking}")
+    if not (isinstance(settings, type) and issubclass(settings, BaseModel)):
+        raise ConfigError(f"{why}: its Settings are {shown(settings)}; make them a subclass of pydantic.BaseModel")
+    made = getattr_static(kind, "from_settings", None)
+    if made is not None and not isinstance(made, classmethod | staticmethod):
+        raise ConfigError(f"{why}: write @classmethod above its from_settings(cls, settings)")
 
 
 def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
@@ -101,17 +114,61 @@ def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
 def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
     """The model of validated settings. Raises :class:`ConfigError` where the class does not fit together."""
     with loading(f"{kind.__name__} cannot be made"):
+        if hasattr(kind, "from_settings"):
+            return checked(kind.from_settings(settings), f"{kind.__name__}.from_settings")
         try:
-            model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
+            return checked(kind())
         except TypeError as error:
-            if hasattr(kind, "from_settings"):
-                raise
-            raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
-        return checked(model)
+            hint = "; a class that takes arguments needs Settings and from_settings" if "required" in str(error) else ""
+            raise ConfigError(f"{error}{hint}") from error
 
 
-def checked(model: ForwardModel) -> ForwardModel:
-    """The model itself. Raises :class:`ConfigError` where what it declares does not fit together."""
+DECLARED: Mapping[str, type] = {  # attributes of a model that are tuples, and of what
+    "parameters": Parameter,
+    "observables": Observable,
+    "optional_parameters": Parameter,
+    "validity": ValidityLimit,
+    "alternatives": Alternative,
+    "path_quantities": PathQuantity,
+    "path_parameters": str,
+}
+
+
+def _require_declared(model: ForwardModel) -> None:
+    """Raise :class:`ConfigError` where an attribute is missing or of another type."""
+    for name, item in DECLARED.items():
+        value = getattr(model, name, None)
+        if not (isinstance(value, tuple | list) and all(isinstance(each, item) for each in value)):
+            raise _undeclared(model, name, f"a tuple of {item.__name__}")
+    if not model.observables:
+        raise _undeclared(model, "observables", "one Observable at least")
+    if not isinstance(getattr(model, "layout", None), StateLayout):
+        raise _undeclared(model, "layout", "StateLayout((Field(…), …))")
+    for name in ("defaults", "known_by", "unforeseen"):
+        if not isinstance(getattr(model, name), Mapping):
+            raise _undeclared(model, name, "a dict")
+    for name in model.path_parameters:
+        if name not in model.layout.names:
+            words = f"{type(model).__name__}: path_parameters: {shown(name)} is not in the layout"
+            raise ConfigError(f"{words}{suggest(name, model.layout.names)}")
+    for observable in model.observables:
+        if not callable(observable.operator):
+            words = f"the operator of {observable.name} is {shown(observable.operator)}, which cannot be called"
+            raise ConfigError(f"{type(model).__name__}: {words}; give a StateField, or a function of a trajectory")
+
+
+def _undeclared(model: ForwardModel, name: str, right: str) -> ConfigError:
+    has = f"{name} is {shown(getattr(model, name))}" if hasattr(model, name) else f"it has no {name}"
+    return ConfigError(f"{type(model).__name__}: {has}; give {right}")
+
+
+def checked(model: Any, who: str = "") -> ForwardModel:
+    """The model itself, which ``who`` made. Raises :class:`ConfigError` where it is none, or what it declares does not
+    fit together.
+    """
+    if not isinstance(model, ForwardModel):
+        raise ConfigError(f"{who} returned {shown(model)}; return the model, such as cls(…)")
+    _require_declared(model)
     observables = model.observables
     for what, declared in (("parameters", model.parameters), ("observables", observables)):
         names = [thing.name for thing in declared]
@@ -188,14 +245,18 @@ def model_listing() -> str:
     """Every registered model, built with its default settings: observables and parameters with units. A model that
     cannot be loaded or whose settings have no defaults is listed with the reason.
     """
-    return "\n\n".join(map(_description, installed(GROUP)))
+    return "\n\n".join(map(_listed, installed(GROUP)))
+
+
+def _listed(name: str) -> str:
+    try:
+        return _description(name)
+    except (En4dvarError, ValueError) as error:  # of one package; the others are listed
+        return f"{name}: {error}"
 
 
 def _description(name: str) -> str:
-    try:
-        kind: Any = find_model(name)
-    except En4dvarError as error:
-        return f"{name}: {error}"
+    kind: Any = find_model(name)
     title = (kind.__doc__ or "").strip().split("\n", 1)[0]
     settings = settings_of(kind)
     needed = [field for field, info in settings.model_fields.items() if info.is_required()]

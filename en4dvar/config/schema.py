@@ -23,7 +23,7 @@ from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import Quantity, parse_quantity
-from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
+from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, require_scheme, require_usable, unread
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.settings import AssimilationSettings, Localisation, beside_localisation, beside_noise
 
@@ -238,13 +238,13 @@ class OfScheme(Section):
             with Faults() as faults, faults.at("scheme"):
                 kind = cls.kinds.get(name, Scheme) if isinstance(name, str) and not known else Scheme
                 cls._require_free(kind, section)
+                require_usable(str(name))
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):
             # The scheme that a file holds
             kind = user_file.load(reference, f"scheme {shown(reference)}")
-            if not (isinstance(kind, type) and issubclass(kind, Scheme)):
-                raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
+            require_scheme(kind, reference)
             cls._require_free(kind, section)
             cls.kinds[reference] = kind
         own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))

@@ -207,9 +207,7 @@ class Composite:
         if not observations.parts:
             quantities = tuple(of_parts[0] for of_parts in self._operators)
             return times, Reading(quantities, limits, self._batched), len(times), rows, at_extra, nodes
-        readouts = tuple(
-            Readout(operator, observations.parts, len(times), rows, at_extra) for operator in self._operators
-        )
+        readouts = tuple(Readout(operator, observations.parts, rows, at_extra) for operator in self._operators)
         k, curves = len(observations), sum(part.has_path for part in observations.parts)
         size = k + curves * len(extra_times)
         return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size), nodes

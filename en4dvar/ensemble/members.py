@@ -6,6 +6,7 @@ in trouble get a reason, the others do not notice.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import methodcaller
 from typing import Any
 
@@ -13,10 +14,11 @@ import numpy as np
 
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
-from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, gives_rate, initial_states
+from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, gives_rate, initial_states, read_along
 from en4dvar.model.state import Array, Field, Indices, floats
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.user_code import own_fault, reason_of
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.user_code import ReturnedError, line_of, own_fault, reason_of
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
 
@@ -75,7 +77,13 @@ class InitialStates:
         theta = {name: physical[:, j].copy() for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
-        states = floats(initial_states(self.problem.model, theta, len(physical)))
+        try:
+            states = floats(initial_states(self.problem.model, theta, len(physical)), "initial_states")
+        except KeyError as error:
+            if (name := str(error.args[0])) in theta:
+                raise
+            words = f"initial_state asks for a parameter {name!r}{suggest(name, theta)}{line_of(error)}"
+            raise ReturnedError(words) from None
         if states.shape != (len(physical), self.size):
             raise ValueError(f"misshapen initial state: {states.shape}, not {(len(physical), self.size)}")
         if self.perturbed or self.problem.fields:
@@ -123,10 +131,6 @@ def _followed(tie: Tie, values: Array) -> Array:
 NOT_FINITE = "non-finite prediction"  # of a member that gives other readings, perhaps
 
 
-class MisshapenError(ValueError):
-    """An observation operator gave another number of values than there are instants."""
-
-
 def _without(failures: list[str]) -> Rows:
     return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
 
@@ -164,11 +168,6 @@ class Reading:
                 continue
             try:
                 predictions = self._all([outcome])
-                if predictions[0].shape[2:] != (n_times,):
-                    raise MisshapenError
-            except MisshapenError:
-                reasons[i] = "misshapen prediction"
-                continue
             except BaseException as error:  # H belongs to the user as well
                 reasons[i] = reason_of(error)
                 continue
@@ -190,7 +189,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Readout:
-    """(…, K + P M) of a path at T instants: the K readings of all parts, then the curves of the P parts that have one.
+    """(…, K + P M) of a path: the K readings of all parts, then the curves of the P parts that have one.
 
     ``operators`` are those of the ``parts``, or their rates; ``rows`` (K,) says at which instant each reading was
     taken, ``along`` (M,) those that a curve is read at.
@@ -198,7 +197,6 @@ class Readout:
 
     operators: tuple[Callable[[Any], Array], ...]
     parts: tuple[Part, ...]
-    n_times: int
     rows: Rows
     along: Rows
 
@@ -206,9 +204,7 @@ class Readout:
         predictions = []
         curves = []
         for operator, part in zip(self.operators, self.parts, strict=True):
-            values, of_field = floats(operator(path)), part.places is not None
-            if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
-                raise MisshapenError
+            values = operator(path)
             rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]
             if part.places is None:
                 predictions.append(values[..., rows])
@@ -230,7 +226,10 @@ def operators_of(parts: Sequence[Part], needs_rates: str = "") -> tuple[Callable
         operator, name = part.observable.operator, part.observable.name
         if needs_rates and not gives_rate(operator):
             raise ConfigError(f"{needs_rates} needs the rate of {name}, which the model does not provide")
-        operators.append(operator.rate if needs_rates and isinstance(operator, RateOperator) else operator)
+        read, what = operator, name
+        if needs_rates and isinstance(operator, RateOperator):
+            read, what = operator.rate, f"the rate of {name}"
+        operators.append(partial(read_along, read, what, part.places is not None))
     return tuple(operators)
 
 

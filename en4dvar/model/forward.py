@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout, floats
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.user_code import reason_of
+from en4dvar.plumbing.errors import ConfigError, retold
+from en4dvar.plumbing.user_code import ReturnedError, reason_of
 
 
 def instants_of(times: npt.ArrayLike, unit: str) -> Array:
@@ -205,6 +205,24 @@ class Observable(Shown):
     event: bool = False
 
 
+def read_along(read: Callable[[Any], Any], what: str, of_field: bool | None, path: "Trajectory | Batch") -> Array:
+    """``what`` the user's ``read``, H or its rate, gives of a path: (…, K), or (…, K, size) where it is ``of_field``;
+    None: either.
+
+    Raises :class:`ReturnedError` where it gives something else; what ``read`` itself raises goes through.
+    """
+    raw, asked = read(path), np.shape(path.times)
+    who = f"{what} ({getattr(read, '__qualname__', f'{type(read).__name__}.__call__')}): "
+    with retold((TypeError, ValueError), ReturnedError, who):
+        values = floats(raw)
+    axes = (0, 1) if of_field is None else (int(of_field),)
+    if values.shape[: len(asked)] != asked or values.ndim - len(asked) not in axes:
+        came = "None" if raw is None else f"shape {values.shape}"
+        cells = ", and each place of the field" if of_field else ""
+        raise ReturnedError(f"{who}{came} instead of shape {asked}: one real number for each time{cells}")
+    return values
+
+
 @dataclass(frozen=True)
 class Shared:
     """A batch that is ready to be integrated by any number of threads.
@@ -312,7 +330,7 @@ class ForwardModel(ABC):
         """State vectors (N, n_state) of N members, parameters as name → (N,). This default repeats the above."""
         n_members = len(next(iter(theta.values())))
         each = ({k: float(v[i]) for k, v in theta.items()} for i in range(n_members))
-        return np.stack([floats(self.initial_state(own)) for own in each])
+        return np.stack([floats(self.initial_state(own), "initial_state") for own in each])
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
@@ -381,7 +399,7 @@ class ForwardModel(ABC):
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:
-                    x = floats(self.step(x, t, float(t_next)))
+                    x = floats(self.step(x, t, float(t_next)), "step")
                 except BaseException as error:  # a model may fail in any way; the reason is kept
                     return Failure(reason_of(error), t)
                 t = float(t_next)

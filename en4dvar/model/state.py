@@ -19,11 +19,20 @@ TransformName = Literal[
 ]
 
 
-def floats(values: npt.ArrayLike) -> Array:
-    """As an array of float64: NaN where an array of :mod:`numpy.ma` is masked."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(float), np.nan)
-    return np.asarray(values, dtype=float)
+def floats(values: npt.ArrayLike, whose: str = "") -> Array:
+    """As an array of float64: NaN where an array of :mod:`numpy.ma` is masked. Raises TypeError or ValueError for what
+    is no real numbers; a TypeError that begins with ``whose`` they are, where that is said.
+    """
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex numbers; give real ones")
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(float), np.nan)
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        if not whose:
+            raise
+        raise TypeError(f"{whose}: {error}") from None
 
 
 def hold_floats(whole: object, *keys: str) -> None:
@@ -31,9 +40,7 @@ def hold_floats(whole: object, *keys: str) -> None:
     for what is no real numbers.
     """
     for key in keys:
-        if np.iscomplexobj(value := getattr(whole, key)):
-            raise TypeError(f"{key}: complex numbers")
-        object.__setattr__(whole, key, floats(value))
+        object.__setattr__(whole, key, floats(getattr(whole, key), key))
 
 
 class Shown:
@@ -176,6 +183,8 @@ class StateLayout:
     fields: tuple[Field, ...]
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.fields, tuple | list) and all(isinstance(f, Field) for f in self.fields)):
+            raise ValueError(f"a state layout is of fields, StateLayout((Field('x'), …)), not of {self.fields!r}")
         names = [f.name for f in self.fields]
         if len(set(names)) != len(names):
             raise ValueError(f"duplicate names in the state layout: {names}")

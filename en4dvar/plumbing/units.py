@@ -119,6 +119,8 @@ def parse_unit(text: str) -> Unit:
 
     A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`.
     """
+    if not isinstance(text, str):
+        raise UnitError(f"a unit is a text such as 'm/s', not {text!r}")
     if len(text) > LONGEST:
         raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
     clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)

@@ -36,6 +36,10 @@ class EndedError(En4dvarError):
     """Code of a user wanted to end the program, or raised what is no :class:`Exception`."""
 
 
+class ReturnedError(En4dvarError):
+    """Code of a user returned what cannot be used: which, what came, what is expected."""
+
+
 class RefusedError(En4dvarError):
     """Code that may not be loaded; see :func:`permission`."""
 
@@ -68,7 +72,7 @@ def own_fault(error: BaseException) -> Exception:
 def reason_of(error: BaseException) -> str:
     """:func:`describe` of :func:`own_fault`: the reason why a member is lost."""
     fault = own_fault(error)
-    return str(fault) if isinstance(fault, EndedError) else describe(fault)
+    return str(fault) if isinstance(fault, EndedError | ReturnedError) else describe(fault)
 
 
 def in_worker() -> None:
@@ -94,9 +98,10 @@ def loading(what: str) -> Iterator[None]:
 
 
 def line_of(error: BaseException) -> str:
-    """The last line of the user's that the error went through; "" where it reached none."""
+    """The last line of the user's that the error went through, if there is one outside of installed packages, or ""."""
     files = [(f.filename, f.lineno) for f in traceback.extract_tb(error.__traceback__)]
     own = [(name, line) for name, line in files if not name.startswith(("<", *_NOT_THE_USERS))]
+    own = [(name, line) for name, line in own if not is_installed(Path(name).resolve())] or own
     return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
 
 

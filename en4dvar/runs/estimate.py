@@ -296,7 +296,7 @@ class GivenSeries:
                 error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
             elif key == "covariance" and np.ndim(value) == 2:
                 file = f"data.{self.name}.covariance.csv".replace("..", ".")
-                matrix, times = floats(value), self.columns[TIME]
+                matrix, times = _floats(value, f"error: {self._of()}{key}"), self.columns[TIME]
                 if matrix.shape != 2 * times.shape:
                     raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
                 if self.name:  # in a file with rows of other series
@@ -318,11 +318,16 @@ class GivenSeries:
             counts = f"{len(value)} numbers for {len(self.columns[TIME])} readings"
             raise DataError(f"error: {self._of()}{key} has {counts}")
         column = f"{self.name} error {key}".lstrip()
-        self.used[column] = floats(value)
+        self.used[column] = _floats(value, f"error: {self._of()}{key}")
         return {"column": column}
 
     def _of(self) -> str:
         return f"{self.name}: " if self.name else ""
+
+
+def _floats(values: Any, whose: str) -> Array:
+    with retold(TypeError, DataError):
+        return floats(values, whose)
 
 
 class Given:
@@ -362,7 +367,7 @@ class Given:
         """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
         if not (isinstance(section, Mapping) and isinstance(members := section.get("ensemble"), Mapping)):
             return section
-        columns = {name: floats(values) for name, values in members.items()}
+        columns = {name: _floats(values, f"prior: {name}") for name, values in members.items()}
         if len({values.shape for values in columns.values()}) != 1 or next(iter(columns.values())).ndim != 1:
             raise DataError("prior: give one number a member for each parameter, of all the same number of members")
         self.beside["data.prior.csv"] = csv_of(columns)

@@ -26,8 +26,8 @@ from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
 from en4dvar.inputs.parts import Column
-from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of
-from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
+from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of, read_along
+from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import listed
@@ -150,11 +150,11 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
     where = {series.name: _places(series, len(times)) for series in _series(config)}
     predictions = {}
     for name, observable in _observables(config).items():
+        places = where.get(name)
         try:
-            values = np.asarray(observable.operator(path), dtype=float)
+            values = read_along(observable.operator, name, places is not None, path)
         except BaseException as error:
             raise En4dvarError(f"{observable.name} cannot be read from the run: {reason_of(error)}") from None
-        places = where.get(name)
         values = values if places is None else places.read(values)
         predictions[name] = read.get(READING_SCALE.name, 1.0) * values + read.get(READING_OFFSET.name, 0.0)
     return predictions
@@ -163,7 +163,7 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
 def _path(model: ForwardModel, theta: Mapping[str, float], times: Array) -> Trajectory:
     """At times on the model's clock. Raises :class:`En4dvarError` where the model fails."""
     try:
-        state = np.asarray(model.initial_state(theta), dtype=float)
+        state = floats(model.initial_state(theta), "initial_state")
     except BaseException as error:
         reason = error if isinstance(error, ValueError) else reason_of(error)
         raise En4dvarError(f"the model refuses its parameters: {reason}") from None
@@ -250,7 +250,7 @@ def _draw(plan: Read[CampaignFile], kind: str, group: GroupSection, number: int)
         except En4dvarError as error:
             reason = str(error)
             continue
-        exact = np.asarray(model.observables[0].operator(path), dtype=float)
+        exact = read_along(model.observables[0].operator, model.observables[0].name, False, path)
         values = exact + noise
         below = np.flatnonzero(values < asked.stop * np.maximum.accumulate(values))
         count = int(below[0]) + 1 if len(below) else asked.most

@@ -1,16 +1,19 @@
 """Assimilation schemes: what is computed, and the keys read. A new one is a class and a line below.
 
 Another package brings schemes of its own by entry points of the group ``en4dvar.schemes``: a name for ``scheme:`` and a
-subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced. They
-are loaded when a registry is first asked for: to write one such a package imports from here.
+subclass of :class:`Scheme`. One that cannot be loaded is left out, and told by :func:`require_usable` to who asks for
+it; a name of ours is not replaced. They are loaded when a registry is first asked for: to write one such a package
+imports from here.
 """
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.installed import installed
+from en4dvar.plumbing.user_code import loading
 from en4dvar.schemes.base import Minimiser, Scheme
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.en4dvar import En4DVar
@@ -35,19 +38,34 @@ _OURS: dict[str, type[Scheme]] = {
 }
 
 
+_unusable: dict[str, str] = {}  # why a scheme of another package cannot be loaded
+
+
 def _installed() -> dict[str, type[Scheme]]:
     kinds = {}
-    for name, entry in installed("en4dvar.schemes").items():
+    for name in (entries := installed("en4dvar.schemes")).keys() - _OURS:
+        what = f"scheme {name!r} ({entries[name].value}) cannot be loaded"
         try:
-            kind = entry.load()
-            if not (isinstance(kind, type) and issubclass(kind, Scheme)):
-                raise TypeError("it is not a subclass of en4dvar.schemes.Scheme")
-        except Exception as error:  # code of another package must not end every command
-            words = f"scheme {name!r} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}"
-            warnings.warn(words, RuntimeWarning, stacklevel=2)
+            with loading(what):
+                kind = entries[name].load()
+            require_scheme(kind, name)
+        except (ConfigError, ValueError) as error:  # code of another package must not end every command
+            _unusable[name] = str(error) if isinstance(error, ConfigError) else f"{what}: {error}"
         else:
             kinds[name] = kind
     return kinds
+
+
+def require_scheme(kind: Any, name: str) -> None:
+    """Raise :class:`ConfigError` where what a ``name`` leads to is no scheme."""
+    if not (isinstance(kind, type) and issubclass(kind, Scheme)):
+        raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.schemes.Scheme")
+
+
+def require_usable(name: str) -> None:
+    """Raise :class:`ConfigError` where an installed scheme of this name cannot be loaded."""
+    if name in _unusable:
+        raise ConfigError(_unusable[name])
 
 
 # name in a configuration → class; its fields are keys of the section ``assimilation:``
@@ -62,7 +80,7 @@ _LATER = "SCHEMES", "ON_A_WINDOW", "ON_A_SERIES", "MINIMISERS", "LOCALISED"
 def __getattr__(name: str) -> Any:
     if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    every = _OURS | _installed() | _OURS  # in this order, and none of ours replaced
+    every = _OURS | dict(sorted(_installed().items()))
     window, series = ({n: kind for n, kind in every.items() if on in kind.on} for on in ("window", "series"))
     minimisers = tuple(n for n, kind in window.items() if issubclass(kind, Minimiser))
     localised = tuple(n for n, kind in window.items() if kind.localised_keys is not None)

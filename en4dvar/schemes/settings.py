@@ -10,7 +10,7 @@ from en4dvar import schemes
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.user_file import is_file_reference
-from en4dvar.schemes import DEFAULT, keys_of, unread
+from en4dvar.schemes import DEFAULT, keys_of, require_usable, unread
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.en4dvar import En4DVar
 
@@ -92,6 +92,7 @@ class AssimilationSettings:
         )  # of settings that are changed by dataclasses.replace
         if before is not None and is_file_reference(scheme):  # which a worker has not read
             kinds.setdefault(scheme, type(before))
+        require_usable(scheme)
         if scheme not in kinds:
             raise ConfigError(f"{scheme!r} is not a scheme for the data of one set{suggest(scheme, list(kinds))}")
         kind, common = kinds[scheme], {f.name: f.default for f in fields(self) if f.name not in ("scheme", "own")}

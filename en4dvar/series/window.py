@@ -12,7 +12,7 @@ from en4dvar.descent.step_control import Move
 from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
-from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory
+from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory, read_along
 from en4dvar.model.state import Array, floats
 from en4dvar.schemes.asked import is_done, linearised, members_of, step_of
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
@@ -68,7 +68,7 @@ def require_finite(paths: Array) -> Array:
 
 def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
     """(K, p): outputs (K,) or (K, q) of the operators along a trajectory, side by side."""
-    outputs = [observable.operator(trajectory) for observable in observables]
+    outputs = [read_along(observable.operator, observable.name, None, trajectory) for observable in observables]
     return outputs[0] if len(outputs) == 1 and outputs[0].ndim == 2 else np.column_stack(outputs)
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from toys import Fragile, Linear, make_problem
 
+from en4dvar.data.noise import noise_of
 from en4dvar.estimation.assimilate import assimilate, cost, forecast
-from en4dvar.model.forward import Observable
+from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import PriorTerm
@@ -98,7 +99,10 @@ def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
 @pytest.mark.parametrize(
     ("operator", "reason"),
     [
-        (lambda path: path["y"][:-1], "misshapen prediction"),
+        (lambda path: path["y"][:-1], "y (<lambda>): shape (8,) instead of shape (9,): one real number for each time"),
+        (lambda path: None, "y (<lambda>): None instead of shape (9,): one real number for each time"),
+        (lambda path: path["y"] * 1j, "y (<lambda>): complex numbers; give real ones"),
+        (lambda path: "high", "y (<lambda>): could not convert string to float: 'high'"),
         (lambda path: np.log(-1 - path["y"] ** 2), "RuntimeWarning: invalid value encountered in log"),
         (lambda path: path["y"] * np.nan, "non-finite prediction"),
         (lambda path: path["z"], "KeyError: 'z'"),
@@ -107,6 +111,36 @@ def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
 def test_observation_operator_that_fails_is_a_failure(operator, reason):
     problem = replace(make_problem(Linear(("a", "b")), [1.0, 1.0]), observable=Observable("y", "m", operator))
     assert set(forecast(problem, problem.prior.sample(4, 0)).failures) == {reason}
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"), [(lambda path: None, "None instead of shape (9,)"), (lambda path: path["y"] * 1j, "complex")]
+)
+def test_a_rate_that_is_no_row_of_numbers_is_told_as_that_of_its_observable(rate, words):
+    class Read:
+        def __call__(self, path):
+            return path["y"]
+
+        def rate(self, path):
+            return rate(path)
+
+    problem = make_problem(Linear(("a", "b")), [1.0, 1.0])
+    timed = replace(problem.observations, noise=noise_of(np.ones(9), np.ones(9)))
+    problem = replace(problem, observable=Observable("y", "m", Read()), observations=timed)
+    (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
+    assert reason.startswith("the rate of y (")
+    assert "Read.rate): " in reason
+    assert words in reason
+
+
+@pytest.mark.parametrize("method", ["initial_state", "step"])
+def test_complex_states_are_told_and_not_cut_to_their_real_parts(method, monkeypatch):
+    problem = make_problem(Linear(("a", "b")), [1.0, 1.0])
+    monkeypatch.setattr(Linear, "trajectories", ForwardModel.trajectories)
+    monkeypatch.setattr(Linear, "step", lambda self, x, t0, t1: x, raising=False)
+    monkeypatch.setattr(Linear, method, lambda self, *asked: np.full(4, 1j))
+    (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
+    assert f"{method}: complex numbers; give real ones" in reason
 
 
 def test_an_initial_state_of_a_wrong_shape_is_told_with_both_shapes(monkeypatch):

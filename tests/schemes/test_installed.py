@@ -1,4 +1,4 @@
-"""A scheme of another package: used by its name, with its keys; one that cannot be loaded is told."""
+"""A scheme of another package: used by its name, with its keys; one that fails to load is told to who asks for it."""
 
 from __future__ import annotations
 
@@ -47,11 +47,14 @@ else:
 def package(tmp_path):
     """The environment of a process that finds the package ``patient`` installed."""
     (tmp_path / "patient.py").write_text(SCHEME)
-    about = tmp_path / "patient-1.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: patient\nVersion: 1\n")
-    entries = "patient = patient:Patient\netkf = patient:Patient\nlost = nowhere:Lost\nnumber = math:pi\n"
-    (about / "entry_points.txt").write_text(f"[en4dvar.schemes]\n{entries}")
+    named = {"patient": "patient:Patient", "etkf": "patient:Patient", "lost": "nowhere:Lost", "number": "math:pi"}
+    declared = {"patient": {**named, "twice": "patient:Patient"}, "again": {"twice": "patient:Other"}}
+    for name, entries in declared.items():
+        about = tmp_path / f"{name}-1.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
+        lines = "".join(f"{key} = {value}\n" for key, value in entries.items())
+        (about / "entry_points.txt").write_text(f"[en4dvar.schemes]\n{lines}")
     config = yaml.safe_load(QUICK_START.read_text(encoding="utf-8"))
     config["data"]["path"] = str(QUICK_START.parent / config["data"]["path"])
     config["output"] = {"report": False}
@@ -67,19 +70,25 @@ def called(*words, environment, folder):
 
 
 def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
-    """Those that cannot be loaded are told and left out."""
+    """Those that cannot be loaded are told where they are asked for, and nowhere else."""
     done = called("-m", "en4dvar.cli", "run", "own.yaml", environment=package, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "scheme 'lost' (nowhere:Lost) cannot be loaded: ModuleNotFoundError" in done.stderr
-    assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
+    assert "cannot be loaded" not in done.stderr
+    assert "not a subclass" not in done.stderr
     resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
     assert resolved["assimilation"]["scheme"] == "patient"
     assert resolved["assimilation"]["patience"] == 4
     text = (tmp_path / "own.yaml").read_text()
     (tmp_path / "negative.yaml").write_text(text.replace("patience: 4", "patience: -1"))
     (tmp_path / "other.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
-    refused = called("-c", REFUSED, "negative.yaml", "other.yaml", environment=package, folder=tmp_path)
-    negative, other = refused.stdout.split("---\n")
+    for name in ("lost", "number", "twice"):
+        (tmp_path / f"{name}.yaml").write_text(text.replace("scheme: patient", f"scheme: {name}"))
+    asked = [f"{name}.yaml" for name in ("negative", "other", "lost", "number", "twice")]
+    refused = called("-c", REFUSED, *asked, environment=package, folder=tmp_path)
+    negative, other, lost, number, twice = refused.stdout.split("---\n")
+    assert "assimilation.scheme: scheme 'lost' (nowhere:Lost) cannot be loaded: No module named 'nowhere'" in lost
+    assert "assimilation.scheme: 'number' is not a subclass of en4dvar.schemes.Scheme" in number
+    assert "'twice' is declared in en4dvar.schemes by again (patient:Other) and patient (patient:Patient);" in twice
     assert negative.startswith("2 ")
     assert "assimilation.patience" in negative
     assert "scheme etkf does not read it; it is a key of patient" in other  # not replaced

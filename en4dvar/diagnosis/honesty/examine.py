@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,11 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import SHORT_STEP, UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
+from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.caution import Caution, caution, of_several_modes, untrusted, worst_first
+from en4dvar.plumbing.hints import shown
+from en4dvar.plumbing.user_code import ReturnedError, line_of, reason_of
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 
@@ -83,14 +87,23 @@ def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequenc
         return ()
     values = {name: np.full(alive.sum(), value) for name, value in problem.fixed.items()}
     values |= dict(zip(problem.prior.names, members[alive].T, strict=True))
-    return [
-        doubt if isinstance(doubt, Caution) else caution("implausible-data", doubt)
-        for part in problem.parts
-        for doubt in problem.model.doubts(
-            part.observable.name,
-            *deepcopy((y.times[part.where], y.values[part.where], predicted[alive, part.where], values)),
-        )
-    ]
+    told = list[str | Caution]()
+    for part in problem.parts:
+        about = deepcopy((y.times[part.where], y.values[part.where], predicted[alive, part.where], values))
+        told += _doubts(problem.model, part.observable.name, *about)
+    return [doubt if isinstance(doubt, Caution) else caution("implausible-data", doubt) for doubt in told]
+
+
+def _doubts(model: ForwardModel, *asked: Any) -> Sequence[str | Caution]:
+    """Those of a model. Raises :class:`ReturnedError` where its method fails."""
+    who = f"{type(model).__name__}.doubts"
+    try:
+        told = model.doubts(*asked)
+    except BaseException as error:
+        raise ReturnedError(f"{who}: {reason_of(error)}{line_of(error)}") from error
+    if not (isinstance(told, tuple | list) and all(isinstance(doubt, str | Caution) for doubt in told)):
+        raise ReturnedError(f"{who} returned {shown(told)}; return a list of texts, [] where there is no doubt")
+    return told
 
 
 def _allowed(a: Analysis, findings: checks.Findings) -> checks.Findings:

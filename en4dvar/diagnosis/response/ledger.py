@@ -143,7 +143,7 @@ def _localised(
     begin = np.tile(start, len(variants))
     times, (instants, rows) = problem.observations.times + shift, problem.observations.instants
     outcomes = problem.model.resumed(x, begin, np.broadcast_to(instants + shift, (len(x), len(instants))))
-    readout = Readout(operators_of(problem.parts), problem.parts, len(instants), rows, slice(0, 0))
+    readout = Readout(operators_of(problem.parts), problem.parts, rows, slice(0, 0))
     read = Reading((readout,), (), batched(problem)).observe(outcomes, len(times))[0][0]
     runs = read.reshape(len(variants), n_cells, len(times))
     later = np.where(times > start[:, None], runs[1:] - runs[0], 0.0)  # changed from the start of each cell on
