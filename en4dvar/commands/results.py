@@ -134,7 +134,7 @@ def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, tru
     if not (stored or comparison.incomparable):
         from en4dvar.runs.finished import sampled_evidences
 
-        evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
+        evidences = [sampled_evidences(run_dir, workers, trust, tell) for run_dir in run_dirs]
         comparison = side_by_side.with_evidences(comparison, evidences)
     if len(comparison.estimates) <= MOST_ROWS:
         echo(f"{side_by_side.estimates_table(comparison)}\n")
@@ -145,10 +145,8 @@ def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, tru
 def _populations(
     run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], known: Known, alone: bool
 ) -> PopulationsCompared | None:
-    """The populations of the runs side by side, told on standard output; None where there are none to compare.
-
-    ``alone``: the folders hold nothing else. Raises :class:`OutputError`: they cannot be compared, and nothing else
-    can be, or options ask for it.
+    """The populations of the runs side by side, told on standard output; None where there are none to compare. Raises
+    :class:`OutputError`: they cannot be, and the folders hold nothing else (``alone``), or options ask for it.
     """
     from en4dvar.report.populations import compare_populations, medians_table, sentences
     from en4dvar.results.together import POPULATION

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
@@ -72,15 +72,13 @@ class TimeColumn(_NamedColumn):
     rate: Annotated[float, quantity(lambda context: f"1/({time_unit(context)})", "positive")] | None = None
     """Frame rate of the camera, e.g. 270 kHz; the column of times is compared with it."""
 
-    @model_validator(mode="after")
-    def _one_of(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if (self.name is None) == (self.step is None):
             raise ValueError("give either 'name' (a column of times) or 'step' (a constant time step)")
         if self.name is not None and "unit" not in self.model_fields_set:
             raise ValueError(f"the unit of column {self.name!r} is missing; write unit: us")
         if self.rate is not None and self.name is None:
             raise ValueError("'rate' is compared with a column of times; a step needs none")
-        return self
 
 
 def _times(section: TimeColumn, context: Context) -> Column | TimeStep:

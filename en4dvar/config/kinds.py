@@ -8,9 +8,9 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
-from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator
 
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.data import DATA, DataPlan
@@ -59,11 +59,9 @@ class Twin(Section):
     initial_std: Annotated[dict[str, float], stds(dynamic_fields)]
     """Std of the initial ensemble, by field of the state."""
 
-    @model_validator(mode="after")
-    def _something_counts(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if self.burn_in >= self.cycles:
             raise ValueError(f"burn_in ({self.burn_in}) leaves none of {self.cycles} cycles")
-        return self
 
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with an absolute path."""
@@ -313,13 +311,10 @@ class CampaignSection(Section):
     groups: Annotated[dict[Name, GroupSection], Field(min_length=1)]
     """Data sets of one kind, by name."""
 
-    @model_validator(mode="after")
-    def _after_time_zero(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         first, shift = self.first[0], self.time_shift[0]
-        with Faults() as faults:
-            if None not in (first, shift) and first + shift < 0:
-                faults.add(("first",), "the first reading could be taken before time zero")
-        return self
+        if None not in (first, shift) and first + shift < 0:
+            faults.add(("first",), "the first reading could be taken before time zero")
 
 
 class CampaignFile(File):

@@ -21,7 +21,7 @@ from en4dvar.config.varies import MODEL_ERROR, PERTURBED, ErrorOf, Initial, Pert
 from en4dvar.inputs.members import read_centres, read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.priors.dependence import Dependence
@@ -240,12 +240,10 @@ def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -
     units = {e.parameter.name: e.parameter.unit for e in entries if isinstance(e, Uncertain)}
     where = ("assimilation", "start", "from")
     if isinstance(start.place, Path):
-        try:
+        with document.placing(*where), retold(DataError, ConfigError):
             if of_sets := read_centres(start.place, units):
                 return of_sets
             members = read_members(start.place, {name: (unit, "") for name, unit in units.items()})
-        except DataError as error:
-            raise ConfigError([document.fault(where, str(error))]) from None
         return {name: float(np.median(values)) for name, values in members.items()}
     values, faults = {}, list[Fault]()
     for name, text in start.place.items():

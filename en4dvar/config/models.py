@@ -72,20 +72,18 @@ class NoSettings(BaseModel):
 def find_model(name: str) -> type[ForwardModel]:
     """The model ``name``: registered, ``package:Class`` or ``/path/file.py:Class``. Raises :class:`ConfigError`."""
     model: Any
-    try:
-        with loading(f"model {shown(name)} cannot be loaded"):
-            if user_file.is_file_reference(name):
-                model = user_file.load(name, f"model {shown(name)}")
-            elif ":" in name:
-                module, _, attribute = name.partition(":")
-                model = getattr(imported(f"model {shown(name)}", module), attribute)
-            else:
-                registered = installed(GROUP)
-                if name not in registered:
-                    raise ConfigError(f"unknown model {shown(name)}{suggest(name, registered)}; or write {OWN}")
-                model = registered[name].load()
-    except ValueError as error:
-        raise ConfigError(f"model {shown(name)} cannot be loaded: {error}") from error
+    what = f"model {shown(name)}"
+    with retold(ValueError, ConfigError, f"{what} cannot be loaded: "), loading(f"{what} cannot be loaded"):
+        if user_file.is_file_reference(name):
+            model = user_file.load(name, what)
+        elif ":" in name:
+            module, _, attribute = name.partition(":")
+            model = getattr(imported(what, module), attribute)
+        else:
+            registered = installed(GROUP)
+            if name not in registered:
+                raise ConfigError(f"unknown {what}{suggest(name, registered)}; or write {OWN}")
+            model = registered[name].load()
     if not (isinstance(model, type) and issubclass(model, ForwardModel)):
         raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
     _require_buildable(model, name)

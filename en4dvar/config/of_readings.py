@@ -368,12 +368,12 @@ def placing(written: Any, context: Context) -> Placing:
 
 def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
     if block is None or block.coordinates is None:
-        message = "the model gives no coordinates for what is observed; write indices, counted from 0, without a unit"
-        raise ConfigError(message, key)
-    if np.ndim(block.coordinates) > 1:
-        message = f"{block.name} has several coordinates a place; write indices, counted from 0, without a unit"
-        raise ConfigError(message, key)
-    return block
+        why = "the model gives no coordinates for what is observed"
+    elif np.ndim(block.coordinates) > 1:
+        why = f"{block.name} has several coordinates a place"
+    else:
+        return block
+    raise ConfigError(f"{why}; write indices, counted from 0, without a unit", key)
 
 
 STATED = TypeAdapter[Any](int | str | list[int | str])

@@ -44,6 +44,9 @@ class Section(Described):
     def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
         """Add what does not go together in a section as given; it is told beside the faults of single keys."""
 
+    def check_values(self, faults: Faults) -> None:
+        """Add, or raise as a ValueError, what does not go together in values that are valid one by one."""
+
     @model_validator(mode="wrap")
     @classmethod
     def _with_rules(cls, section: Any, validate: ModelWrapValidatorHandler[Self], info: Any) -> Self:
@@ -52,7 +55,9 @@ class Section(Described):
                 with suppress(Unknown):
                     cls.rules(section, info.context, faults)
             with faults.at(schema=cls):
-                return validate(section)
+                checked = validate(section)
+                checked.check_values(faults)
+                return checked
 
     def part(self, kind: type[T]) -> T:
         """A dataclass whose fields are keys of this section."""
@@ -159,13 +164,11 @@ class Execution(Section):
         """What a worker process may take."""
         return Limits(self.time_limit, None if self.memory_limit is None else parse_bytes(self.memory_limit))
 
-    @model_validator(mode="after")
-    def _belongs_to_the_executor(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if self.limits and self.executor in ("serial", "threads"):
             raise ValueError(f"only a process is ended at its limit; write executor: processes, not {self.executor}")
         if self.address is not None and self.executor not in (None, "dask"):
             raise ValueError(f"address is for a dask scheduler only; write executor: dask, not {self.executor}")
-        return self
 
 
 def _of_coordinates(context: Context) -> str:
@@ -258,9 +261,7 @@ class OfScheme(Section):
 
     @classmethod
     def _require_free(cls, kind: type[Scheme], section: Any) -> None:
-        """Raise :class:`ConfigError` where a key of the scheme has a name that means something else in the section,
-        or has no default and is not given.
-        """
+        """Raise :class:`ConfigError` for a key whose name is taken, or one without a default that is not given."""
         own = cls.model_fields.keys() - frozenset().union(*map(keys_of, cls.kinds.values()))
         names = [key.name for key in fields(kind)]
         if taken := [name for name in names if name in own or hasattr(cls, name) or name.startswith("_")]:

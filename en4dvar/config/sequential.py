@@ -3,10 +3,10 @@
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from en4dvar.config.context import TEXT, Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, quantity, subject_unit
@@ -18,8 +18,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
-from en4dvar.series.settings import Inflation, SequentialSettings
-from en4dvar.series.smoothers import EnKS, EnRTS
+from en4dvar.series.settings import EnKS, EnRTS, Inflation, SequentialSettings
 from en4dvar.series.start import EnsembleCoordinates
 
 STD = quantity(subject_unit, "positive", error=True)
@@ -55,11 +54,9 @@ class SeriesLocalisation(Section):
     """Cells along each axis of a field in two or three dimensions, the last running fastest; distances are then in
     cells of this grid. Default: the indices lie on a line."""
 
-    @model_validator(mode="after")
-    def _one_cell_each(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if self.shape and self.block_size > 1:
             raise ValueError("block_size: only without shape")
-        return self
 
 
 class Smoothing(Section):
@@ -72,11 +69,9 @@ class Smoothing(Section):
     lag: Annotated[int, Field(ge=1)] = 10
     """enks: cycles that an observation acts back on."""
 
-    @model_validator(mode="after")
-    def _lag_of_enks(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if self.method == "enrts" and "lag" in self.model_fields_set:
             raise ValueError("lag: only with method enks; enrts smooths by all later observations")
-        return self
 
     @property
     def made(self) -> EnKS | EnRTS:
@@ -124,19 +119,17 @@ class Sequential(_OnASeries):
     stochastic_model: bool = False
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
-    @model_validator(mode="after")
-    def _belongs_together(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
-            return self  # told already
+            return  # told already
         # settings that do not go together are told here, in their place
         anywhere = BlockLocalisation((), np.empty((0, 0)))
         settings = SequentialSettings(
             self.made, localisation=anywhere if self.localisation else None,
             smoother=self.smoother.made if self.smoother else None,
         )  # fmt: skip
-        with Faults() as faults, faults.at("additive"):
+        with faults.at("additive"):
             replace(settings, model_error=ModelError(np.ones(1), self.additive))
-        return self
 
     @property
     def made(self) -> Any:

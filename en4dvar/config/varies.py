@@ -6,11 +6,10 @@ The latter is ``varies:`` of a parameter and ``model_error:`` of fields of the s
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from annotated_types import Ge
-from pydantic import model_validator
 
 from en4dvar.config.context import Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, Spread, parse_spread, quantity, subject_unit, time_unit
@@ -156,13 +155,10 @@ class Knots(Section):
         if ("every" in keys) == ("at" in keys):
             faults.add((), "give either every (length of a piece) or at (list of knots)")
 
-    @model_validator(mode="after")
-    def _increasing(self) -> Self:
+    def check_values(self, faults: Faults) -> None:
         at = None if self.at == "maxima" or self.at is None or None in self.at else self.at
-        with Faults() as faults:
-            if at is not None and (not at or any(b <= a for a, b in itertools.pairwise(at))):
-                faults.add(("at",), "give at least one knot, and each later than the one before it")
-        return self
+        if at is not None and (not at or any(b <= a for a, b in itertools.pairwise(at))):
+            faults.add(("at",), "give at least one knot, and each later than the one before it")
 
     def knots(self, observations: Observations) -> tuple[float, ...]:
         """Those for a window of observations. Raises :class:`ConfigError`: none is of use."""

@@ -49,10 +49,7 @@ class _Worker:
             self.pipe.send_bytes(message)
 
     def answer(self, tell: Tell | None = None) -> Any:
-        """Wait for the call to end; its value or what it raised. None as the worker starts.
-
-        Raises :class:`_DeadError`.
-        """
+        """The value of the call that ends, or what it raised; None as the worker starts. Raises :class:`_DeadError`."""
         while True:
             content = memoryview(self.receive())
             try:
@@ -202,7 +199,10 @@ def _end(workers: list[_Worker]) -> None:
 
 def _serve(pipe: Connection, limits: Limits, folder: str) -> None:
     """What a worker does until its pipe is closed. Names of files mean what they mean in ``folder``."""
-    prepare_worker(limits)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's business
+    in_worker()
+    apply_limits(limits)
+    threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()
     with contextlib.suppress(OSError):  # a new process is where the main process was when that began
         os.chdir(folder)
 
@@ -244,15 +244,8 @@ def _unsendable(error: Exception) -> TypeError:
     )
 
 
-def prepare_worker(limits: Limits = NO_LIMITS) -> None:
-    """Ctrl-C is the main process's business, BLAS uses one thread, and nobody works for a main process that is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    in_worker()
-    apply_limits(limits)
-    threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()
-
-
 def _end_with_parent() -> None:
+    """Nobody works for a main process that is gone."""
     parent = parent_process()
     if parent is not None:
         parent.join()

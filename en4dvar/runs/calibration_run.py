@@ -116,11 +116,11 @@ class CalibrationKind(RunKind[Calibration]):
         fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())
         kept = KeptUnits(run, STATE, fingerprint, Judged, "all sets are estimated again")
         known = {judged.number for judged in kept.done}
-        common = CommonValue((self.config, self.made, list(self.data.items())))
+        common, names = CommonValue((self.config, self.made, list(self.data.items()))), list(self.data)
         calls = [(common, number) for number in range(1, self.sets + 1) if number not in known]
         kept.work(
             executor, _judged, calls, self.progress, self.sets,
-            failed=lambda _, number, reason: Judged(number, "", failure=reason),
+            failed=lambda _, number, reason: Judged(number, names[(number - 1) % len(names)], failure=reason),
             line=lambda judged: f"set {judged.number}: {judged.failure or 'estimated'}",
         )  # fmt: skip
         told = sorted((judged for judged in kept.done if judged.number <= self.sets), key=lambda judged: judged.number)
@@ -133,17 +133,14 @@ class CalibrationKind(RunKind[Calibration]):
 
 
 def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]]], number: int) -> Judged:
-    """Draw set ``number``, estimate it, and compare with its truth; text says why it cannot be."""
+    """Draw set ``number``, estimate it, and compare with its truth. Raises :class:`En4dvarError`."""
     config, made, files = common.value
     name, file = files[(number - 1) % len(files)]
     seed = own_seed(config.seed, f"calibration {number}")
     problem, maker = build_one(config, name, file), build_one(made, name, file)
-    try:
-        truth, readings = draw_set(maker, seed)
-        observed = replace(problem.observations, values=readings, continued=None, name=f"{name}_{number}")
-        return _compared(replace(problem, observations=observed), config, seed, truth, number, name)
-    except En4dvarError as error:
-        return Judged(number, name, failure=str(error))
+    truth, readings = draw_set(maker, seed)
+    observed = replace(problem.observations, values=readings, continued=None, name=f"{name}_{number}")
+    return _compared(replace(problem, observations=observed), config, seed, truth, number, name)
 
 
 def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]:
@@ -164,9 +161,7 @@ def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]
 def _compared(
     problem: InverseProblem, config: Config, seed: int, truth: Mapping[str, float], number: int, name: str
 ) -> Judged:
-    """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings; NaN of J_o where
-    the truth lacks a parameter or lies beyond the prior.
-    """
+    """Ranks, quantiles and z of every parameter and of J_o; NaN where the truth lacks one or lies beyond the prior."""
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
     members = prior.from_physical(analysis.posterior)

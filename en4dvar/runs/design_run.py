@@ -86,7 +86,6 @@ def run_design(
 
     ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next? Of a
     population what it says of its next data set.
-    ``on_design`` is called with how many designs are done, and of how many.
 
     Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
     :class:`OutputError`: the directory cannot.
@@ -156,9 +155,7 @@ class DesignKind(RunKind[Designs]):
         return load_designs(file)
 
     def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
-        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off. A nested
-        estimate of few effective draws is no check: the linearised one stands and says so.
-        """
+        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
         every, method = range(len(self.every)), self.config.design.method
         if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
             self._evaluate(kept, executor, every, "laplace" if method == "auto" else method)
@@ -170,6 +167,7 @@ class DesignKind(RunKind[Designs]):
         both = (
             pair for d in kept.done if d.method == "nested" for pair in zip(d.results, told[d.number], strict=False)
         )
+        # a nested estimate of few effective draws is no check: the linearised one stands and says so
         if any(abs(n.gain - o.gain) > AGREE + 2 * n.error for n, o in both if n.thin <= THIN):
             self._evaluate(kept, executor, list(told), "nested")
 
@@ -253,21 +251,18 @@ def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, b
 
 
 def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
-    """Evaluate a candidate in a worker."""
+    """Evaluate a candidate in a worker. Raises :class:`En4dvarError`."""
     config, design = candidate.config, candidate.config.design
-    try:
-        problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
-        sizes, alike = design.part(SampleSizes), design.experiments
-        choice = (design.choose.readings, design.choose.apart) if design.choose else None
-        told = design.common, _wanted(config, problem)
-        every = evaluate(problem, design.about, sizes, method, seed, alike, choice, laws, *told)
-        costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
-        broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
-        kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        left = (f"{o.alike} experiments: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
-        return Done(number, method, kept, "; ".join(left) if kept else broken[0])
-    except En4dvarError as error:
-        return Done(number, method, (), str(error))
+    problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
+    sizes, alike = design.part(SampleSizes), design.experiments
+    choice = (design.choose.readings, design.choose.apart) if design.choose else None
+    told = design.common, _wanted(config, problem)
+    every = evaluate(problem, design.about, sizes, method, seed, alike, choice, laws, *told)
+    costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
+    broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
+    kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
+    left = (f"{o.alike} experiments: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
+    return Done(number, method, kept, "; ".join(left) if kept else broken[0])
 
 
 def _line(done: Done) -> str:

@@ -61,12 +61,8 @@ class Kind:
 
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
-        """Write the page of a finished run from its result files; None for a kind that has none.
-
-        ``folder``: of the run. ``datasets``: those that get a page of their own in any case. ``workers``: processes
-        that draw. ``figures``: also keep the figures as PDF and PNG.
-
-        Raises :class:`OutputError`.
+        """Write the page of the run in ``folder`` from its result files, with arguments and errors as of
+        :func:`write_report`; None for a kind that has none.
         """
         if not cls.writer:
             return None
@@ -207,9 +203,11 @@ class KeptUnits(Generic[S]):
         in an error, ``line`` is what the log says of a unit.
         """
         for count, (i, ended) in enumerate(executor.map(function, iter(calls)), 1):
-            unit = failed(*calls[i], reason=reason_of(ended)) if isinstance(ended, Exception) else ended
-            self.done.append(unit)
-            self.log.write(line(unit))
+            if isinstance(ended, Exception):
+                reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
+                ended = failed(*calls[i], reason=reason)
+            self.done.append(ended)
+            self.log.write(line(ended))
             self.keeper.keep(lambda: tuple(self.done))
             if tell:
                 tell(total - len(calls) + count, total)
@@ -276,13 +274,8 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
 
 @contextmanager
 def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Iterator[Session]:
-    """Hold the log of a run in its ``directory``, and put the result in place where the block ends well.
-
-    ``command``: what the user typed. What the user has of a run that is stopped becomes part of the last words of an
-    interrupt and of errors that a resumed run survives.
-
-    Raises :class:`OutputError`: the log cannot be written, the result not put in place. :class:`Interrupted`: the block
-    was.
+    """Hold the log of a run, put the result in place where the block ends well, and tell what is kept where it does
+    not. Raises :class:`OutputError`: the log or the result cannot be written; :class:`Interrupted`.
     """
 
     def kept() -> str:

@@ -37,13 +37,10 @@ from en4dvar.runs.rundir import GIVEN, holds_run
 from en4dvar.runs.runner import run_campaign
 
 MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'lorenz63'}"
-ARGUMENTS = {
-    ("data", "error"): "error",
-    ("data", "window"): "window",
-    ("data", "series"): "series",
-    ("data", "correlation"): "correlation",
-    ("parameters",): "priors",
-    ("sequence", "initial_std"): "initial_std",
+ARGUMENTS = {  # section of a file → argument
+    **{f"data.{argument}": argument for argument in ("error", "window", "series", "correlation")},
+    "parameters": "priors",
+    "sequence.initial_std": "initial_std",
 }
 ARRAYS = "arrays of a script"
 FILES = ("path", "ensemble", "from")  # keys of files
@@ -195,13 +192,9 @@ def _from_here(value: Any, key: Any = "") -> Any:
 
 
 def _argument(path: str) -> str:
-    parts = tuple(path.split("."))
-    if parts[:2] == ("data", "series") and parts[3:4] == ("error",):
-        return ".".join(("error", parts[2], *parts[4:]))
-    for place, argument in ARGUMENTS.items():
-        if parts[: len(place)] == place:
-            return ".".join((argument, *parts[len(place) :]))
-    return path
+    path = re.sub(r"^data\.series\.([^.]+)\.error(?=\.|$)", r"data.error.\1", path)
+    place = next((place for place in ARGUMENTS if f"{path}.".startswith(f"{place}.")), "")
+    return ARGUMENTS.get(place, "") + path.removeprefix(place)
 
 
 def _keep_data(directory: Path, files: Mapping[str, str], replaces: bool) -> None:
@@ -230,12 +223,9 @@ class GivenSeries:
     columns: Mapping[str, Array]
     observable: str | None
     error: Any
-    more: Mapping[str, Any] = field(default_factory=dict)
-    used: dict[str, Array] = field(init=False)
+    more: Mapping[str, Any]
+    used: dict[str, Array]
     files: dict[str, str] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        self.used = {TIME: self.columns[TIME]}
 
     def observed(self, known: Sequence[str]) -> str:
         """The name of what was observed, of the ``known`` ones. Raises :class:`ConfigError`."""
@@ -361,7 +351,7 @@ class Given:
             chosen: Any = observable if self.alone else str(more.get("observable", name))
             with retold(DataError, DataError, f"data: {name}: " if name else "data: "):
                 columns = columns_of(table, time, chosen or _only(self.of_section[0] if self.of_section else model))
-            self.series.append(GivenSeries(name, columns, chosen, own, more))
+            self.series.append(GivenSeries(name, columns, chosen, own, more, {TIME: columns[TIME]}))
 
     def prior(self, section: Any) -> Any:
         """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""

@@ -124,14 +124,12 @@ def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
         yield s
 
 
-def sampled_evidences(
-    run_dir: Path, workers: int | None, trust: bool, ask: Ask | None, tell: Callable[[str], None]
-) -> Mapping[str, float]:
+def sampled_evidences(run_dir: Path, workers: int | None, trust: bool, tell: Callable[[str], None]) -> dict[str, float]:
     """Data set → log-evidence, by the draws that its estimate has kept or by its own, where enough are effective.
     ``tell`` gets a line where there are none: a model that is not cheap, draws that fail, code that is not run unasked.
     """
     try:
-        config, sets = finished([run_dir], trust, ask)
+        config, sets = finished([run_dir], trust, None)
         if not all(s.problem.model.cheap for s in sets):
             raise ConfigError("its model is not cheap")
         with choose_executor(config.model, None, workers) as executor, one_blas_thread():

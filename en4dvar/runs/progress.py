@@ -18,6 +18,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.compiled import watch_compilation
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import own_file, refused
+from en4dvar.plumbing.hints import short
 from en4dvar.plumbing.tables import without_control
 from en4dvar.plumbing.units import convert
 from en4dvar.runs.interrupt import Interrupted
@@ -123,8 +124,7 @@ class LiveProgress:
     def __call__(self, name: str, record: Record) -> None:
         if isinstance(record, StartRecord | IterationRecord):
             self._open[name] = record.rounds if isinstance(record, StartRecord) else record.iteration
-        known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-        self._show(f"{known} {_words(record, 1)}")
+        self._show(f"{short(name, LONGEST_NAME)} {_words(record, 1)}")
 
     def compiling(self) -> None:
         """The model is being compiled, which later runs are spared."""

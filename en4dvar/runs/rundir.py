@@ -222,7 +222,12 @@ def replace_earlier_run(path: Path) -> None:
     following = inside(path, NEXT)
     names = listed_files(following)
     targets = [inside(path, name) for name in names]
-    _remove(path, set(listed_files(path)) - set(names))
+    for file in (inside(path, name) for name in set(listed_files(path)) - set(names)):
+        if file.is_file():
+            file.unlink()
+    for folder in (inside(path, name) for name in FOLDERS):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
     for name, target in zip(names, targets, strict=True):
         if (following / name).exists():
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -236,15 +241,6 @@ def remove_folder(folder: Path) -> None:
     """Remove a folder and what is in it, if it is there; links in it are removed, not followed."""
     if folder.is_dir():
         shutil.rmtree(folder)
-
-
-def _remove(path: Path, names: Iterable[str]) -> None:
-    for name in names:
-        if (file := inside(path, name)).is_file():
-            file.unlink()
-    for name in FOLDERS:
-        if (folder := inside(path, name)).is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
 
 
 def remove_partial(work: Path) -> None:

@@ -187,19 +187,16 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
             columns = [replace(column, name=plan.name) for column, plan in zip(columns, series, strict=True)]
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
-    times = convert(simulation.times, time.target, time.unit)
-    values = [
-        convert(v, column.target, column.unit) for column, v in zip(columns, simulation.series.values(), strict=True)
-    ]
-    units_of_columns = ", ".join(f"{column.name} in {column.unit}" for column in (time, *columns))
-    comments = [*comment.splitlines(), f"parameters: {truth}", units_of_columns]
-    return _commented(comments, [column.name for column in (time, *columns)], [times, *values], ".9g")
+    columns = [time, *columns]
+    comments = [*comment.splitlines(), f"parameters: {truth}", ", ".join(f"{c.name} in {c.unit}" for c in columns)]
+    return _commented(comments, columns, [simulation.times, *simulation.series.values()], ".9g")
 
 
-def _commented(comments: Sequence[str], names: Sequence[str], columns: Sequence[Array], form: str) -> str:
-    """Columns as CSV, whose numbers have a form, below comments and names."""
-    rows = (",".join(f"{value:{form}}" for value in row) for row in zip(*columns, strict=True))
-    return "\n".join([*(f"# {line}" for line in comments), ",".join(names), *rows]) + "\n"
+def _commented(comments: Sequence[str], columns: Sequence[Column], values: Sequence[Array], form: str) -> str:
+    """Values (K,) of each column in its unit, written in a form, as CSV below comments and names."""
+    written = (convert(v, column.target, column.unit) for column, v in zip(columns, values, strict=True))
+    rows = (",".join(f"{value:{form}}" for value in row) for row in zip(*written, strict=True))
+    return "\n".join([*(f"# {line}" for line in comments), ",".join(c.name for c in columns), *rows]) + "\n"
 
 
 # A synthetic campaign
@@ -276,15 +273,15 @@ def write_campaign(
 
 def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> str:
     model, seen = plan.model, plan.model.observables[0]
-    t, v = f"t_{model.time_display_unit}", f"{seen.symbol.strip('$')}_{seen.display_unit}"
+    t = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
+    v = Column(f"{seen.symbol.strip('$')}_{seen.display_unit}", seen.display_unit, seen.unit)
     noise = convert(plan.file.campaign.noise, seen.unit, seen.display_unit)
     comments = [
         f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
         f"{command}; seed {plan.file.seed}",
-        f"{t} in {model.time_display_unit}, {v} in {seen.display_unit}; noise std {noise:.9g} {seen.display_unit}",
+        f"{t.name} in {t.unit}, {v.name} in {v.unit}; noise std {noise:.9g} {v.unit}",
     ]
-    times = convert(dataset.times, model.time_unit, model.time_display_unit)
-    return _commented(comments, [t, v], [times, convert(dataset.values, seen.unit, seen.display_unit)], ".5f")
+    return _commented(comments, [t, v], [dataset.times, dataset.values], ".5f")
 
 
 def truth_csv(plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...]) -> str:

@@ -333,10 +333,8 @@ class Worklist:
 
     def _job(self, d: Dataset, stop: threading.Event | None) -> Job:
         fingerprint, path = self._fingerprint(d), self._checkpoint(d)
-        before = (
-            self.run.restore(d.iteration, fingerprint, KnownRuns, f"{d.name} is estimated from the start")
-            or KnownRuns()
-        )
+        again = f"{d.name} is estimated from the start"
+        before = self.run.restore(d.iteration, fingerprint, KnownRuns, again) or KnownRuns()
         if before.forecasts:
             self.run.log.write(f"{d.name}: continued after {sum(map(len, before.forecasts))} forward runs")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
@@ -344,9 +342,8 @@ class Worklist:
         return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:
-        """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
-        removed, never written in place. To look at each for a link is a tenth of what a data set costs this process.
-        """
+        """Where its iterations are kept."""
+        # the folder was looked at as the run began; to look at each file for a link takes a tenth of the work here
         return self.run.directory.work / d.iteration
 
     def _hear_one(self, problem: InverseProblem, name: str, record: Record) -> None:

@@ -98,6 +98,7 @@ class _Run:
     ):
         self.flow, self.error = flow, flow.error
         self.series, self.settings, self.scheme, self.seed = series, settings, settings.scheme, seed
+        self.physical = settings.coordinates.to_physical
         self.initial_members, size = members.shape
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         cycles = len(series.times)
@@ -173,10 +174,7 @@ class _Run:
         self.done = newest
 
     def forecast(self, first: int, newest: int) -> list[Array]:
-        """The members that are to be analysed: of a filter at the newest time, else with the changes up to there.
-
-        Before them, where a square root takes from a member its past, those that the model made of the past.
-        """
+        """The members to analyse; before them, where a square root takes their past, those that the model has made."""
         members = self.ensemble
         if self.scheme.lag == 0:
             _, (members,) = self.run(members, [newest])
@@ -240,7 +238,9 @@ class _Run:
         if beyond:
             ahead = at[newest + 1]
             self.record_ahead([Ahead(newest + 1, ahead, self.flow.predict(ahead, newest + 1), 1.0)])
-        self.keep_members(first, newest, at[newest])
+        every = self.settings.members_every
+        if newest == last or (every and any(i % every == 0 for i in range(first, newest + 1))):
+            self.kept.append((newest - 1, self.physical(at[newest])))
         if repeated:
             rows, (moved,) = self.run(self.ensemble, [next_start])
             self.ensemble = self.ensemble[rows]
@@ -252,9 +252,7 @@ class _Run:
         self.start = next_start
 
     def interpolated(self, window: CycleWindow, newest: int) -> tuple[Array, Array]:
-        """Mean and anomalies (N, n) after an analysis with averaged covariances, in which a time weighs by its number:
-        what the members were before they had forgotten their start fades.
-        """
+        """Mean and anomalies (N, n) after an analysis with averaged covariances, in which later times weigh more."""
         (ahead,) = window.ahead
         reference, predicted = centre(ahead.predicted)
         now = (each.T @ predicted / (len(predicted) - 1) for each in (window.anomalies, predicted))
@@ -267,16 +265,8 @@ class _Run:
         increment = (vectors.T @ d / values) @ cross
         return window.mean + increment, window.anomalies - (S.T @ vectors / (values + np.sqrt(values))) @ cross
 
-    def keep_members(self, first: int, newest: int, states: Array) -> None:
-        every, last = self.settings.members_every, len(self.series.times)
-        if newest == last or (every and any(i % every == 0 for i in range(first, newest + 1))):
-            self.kept.append((newest - 1, self.physical(states)))
-
     def put_smoothed(self, cycle: int, states: Array) -> None:
         self.smooth.put(cycle, self.physical(states))
-
-    def physical(self, states: Array) -> Array:
-        return self.settings.coordinates.to_physical(states)
 
     def record_ahead(self, expected: Sequence[Ahead]) -> None:
         """What was expected of observations before they were assimilated."""
@@ -291,10 +281,7 @@ class _Run:
             self.predicted.put(at.index - 1, predicted)
 
     def check_repeats(self) -> None:
-        """Two members, over the first interval, twice: in one order and in the other; no cycle uses these runs.
-
-        Raises :class:`ConfigError`: they differ.
-        """
+        """Raise :class:`ConfigError` where two members, over the first interval, differ when they are run again."""
         flow, start = self.flow, self.start
         end = next((i for i in range(start + 1, len(flow.times)) if flow.times[i] > flow.times[start]), None)
         if end is None:

@@ -17,10 +17,10 @@ def test_a_cheap_model_is_sampled_and_another_says_so(tmp_path, monkeypatch):
     overrides = {"output.report": False, "output.directory": str(tmp_path / "run")}
     run = run_campaign(make_campaign(tmp_path, n=2), overrides=overrides).directory
     told: list[str] = []
-    assert sampled_evidences(run, None, False, None, told.append) == {}
+    assert sampled_evidences(run, None, False, told.append) == {}
     assert "not cheap" in told[0]
     monkeypatch.setattr(ForwardModel, "cheap", True)
-    found = sampled_evidences(run, None, False, None, told.append)
+    found = sampled_evidences(run, None, False, told.append)
     assert len(told) == 1
     for one in finished([run], False, None)[1]:
         middle, width = one.white.mean(axis=0), 6 * one.white.std(axis=0)

@@ -26,8 +26,7 @@ from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import Moments, SequentialState
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
-from en4dvar.series.settings import Inflation
-from en4dvar.series.smoothers import EnKS, EnRTS
+from en4dvar.series.settings import EnKS, EnRTS, Inflation
 
 YAML = """\
 name: ring

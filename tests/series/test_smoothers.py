@@ -16,8 +16,7 @@ from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
-from en4dvar.series.settings import Inflation
-from en4dvar.series.smoothers import EnKS, EnRTS
+from en4dvar.series.settings import EnKS, EnRTS, Inflation
 
 
 @pytest.mark.parametrize("rotation", [False, True])
