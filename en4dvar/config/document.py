@@ -129,7 +129,13 @@ def document_of(content: Mapping[Any, Any]) -> Document:
     data = _plain(content, (), document, faults)
     if faults:
         raise ConfigError(faults)
-    return replace(document, data=data, text=yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120))
+    return replace(document, data=data, text=yaml_text(data))
+
+
+def yaml_text(data: Any) -> str:
+    """Plain data as YAML, in its own order; by the compiled library where PyYAML has it."""
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=120))
 
 
 def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> Any:

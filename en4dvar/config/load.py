@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import Field
 
 from en4dvar.config.context import Context, Made, check
 from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.dependence import Groups, PopulationSection, PriorCorrelation, PriorFile, Sharing, resolved
 from en4dvar.config.design import Design, Times, read_times
-from en4dvar.config.document import Document, Source, document_from, parse_document
+from en4dvar.config.document import Document, Source, document_from, parse_document, yaml_text
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
@@ -190,7 +189,7 @@ class Read(Generic[S]):
             name, unit = entry.parameter.name, entry.parameter.unit
             if isinstance(entry, Fixed) and name not in content["parameters"]:
                 content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
-        resolved = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+        resolved = yaml_text(content)
         said |= {"document": self.document, "model": self.model, "name": file.name, "seed": file.seed}
         return {**said, "execution": file.execution, "resolved": resolved}
 

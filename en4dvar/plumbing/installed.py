@@ -41,8 +41,9 @@ def installed(group: str) -> dict[str, EntryPoint]:
     return {n: e[0] if len(e) == 1 else Contested.of(tuple(e)) for n, e in sorted(named.items())}
 
 
+@cache
 def _is_ours(entry: EntryPoint) -> bool:
-    return entry.dist is not None and entry.dist.name == "en4dvar"
+    return bool(entry.dist and entry.dist.name == "en4dvar")
 
 
 @cache

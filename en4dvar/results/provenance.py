@@ -22,6 +22,7 @@ from typing import Any
 
 import yaml
 
+from en4dvar.config.document import yaml_text
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import OutputError
@@ -150,7 +151,7 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -
     named = [content["model"], stated, *(content.get(key) for key in _PRIOR_FILES)]
     sources |= {str(path): file_digest(path) for path in _paths(named)}
     settings |= {"software": software, "sources": sources}
-    text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
+    text = yaml_text(settings)
     return Identity(text, tuple((name, digest_of(file.paths)) for name, file in data.items()))
 
 

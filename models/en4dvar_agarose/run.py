@@ -21,6 +21,7 @@ import yaml
 
 from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import Config
+from en4dvar.config.document import yaml_text
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.joint import Single, estimate_jointly, sharing
 from en4dvar.estimation.population import Population, population_of
@@ -106,7 +107,7 @@ def identity_of(seed: int, sweep: SweepSettings, configs: Mapping[str, Config]) 
             values.update(each[name].pop(key))
         data += [(f"{name}, {dataset}", digest) for dataset, digest in own.data]
     settings = {"seed": seed, "sweep": asdict(sweep), "configurations": each, **common}
-    return Identity(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120), tuple(data))
+    return Identity(yaml_text(settings), tuple(data))
 
 
 def named(*words: str) -> str:

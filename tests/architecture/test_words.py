@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -39,10 +40,16 @@ def words(name: str) -> list[str]:
     return [w.lower() for part in name.split("_") for w in re.findall(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])", part)]
 
 
+@cache
+def nodes(source: str) -> tuple[ast.AST, ...]:
+    """All of a file's syntax, read once for all tests."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
 def names(source: str) -> set[str]:
     """Every class, function and parameter that a file defines."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(source):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             found.add(node.name)
         elif isinstance(node, ast.arg):
@@ -58,7 +65,7 @@ def vague(source: str) -> list[int]:
     """Lines on which a variable or an argument is bound to a vague name."""
     return sorted(
         node.lineno
-        for node in ast.walk(ast.parse(source))
+        for node in nodes(source)
         if (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in VAGUE)
         or (isinstance(node, ast.arg) and node.arg in VAGUE)
     )
@@ -95,7 +102,8 @@ def test_a_class_name_has_one_meaning():
     """No two modules of the framework define a public class of the same name."""
     homes: dict[str, list[str]] = {}
     for path in sorted((ROOT / "en4dvar").rglob("*.py")):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        module, *_ = nodes(path.read_text(encoding="utf-8"))
+        for node in module.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}

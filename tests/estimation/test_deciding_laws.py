@@ -52,14 +52,14 @@ def test_against_evidences_in_closed_form(std):
 
 
 def test_laws_that_are_the_same_cannot_be_told_apart():
-    found = deciding([_law(0.3), _law(0.3), _law(0.3)], 10, 100, 1)
+    found = deciding([_law(0.3), _law(0.3), _law(0.3)], 4, 60, 1)
     assert found.probability == pytest.approx(1 / 3, abs=0.01)
     assert found.information == pytest.approx(0, abs=0.005)
     assert found.decided == 0
 
 
 def test_laws_that_are_far_apart_always_are():
-    found = deciding([_law(0.01), _law(0.01, ("a", "b", "c", "d"))], 12, 100, 1)
+    found = deciding([_law(0.01), _law(0.01, ("a", "b", "c", "d"))], 5, 60, 1)
     assert found.probability > 0.98
     assert found.information == pytest.approx(np.log(2), abs=0.04)
     assert found.decided_error > 0

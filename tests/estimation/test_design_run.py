@@ -230,7 +230,7 @@ def test_what_is_taken_to_the_lab(tmp_path):
 
 def test_as_a_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "plan.yaml").write_text(json.dumps(_plan()))
+    (tmp_path / "plan.yaml").write_text(json.dumps(_plan(knobs={}, method="laplace")))
     outcome = CliRunner().invoke(main, ["design", "plan.yaml", "--set", "output.report=true"])
     assert outcome.exit_code == 0, outcome.output
     assert "what is known" in outcome.output

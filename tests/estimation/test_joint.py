@@ -130,7 +130,7 @@ def test_importance_gives_the_same_posterior_and_evidence():
 
 
 def test_more_draws_where_two_rounds_leave_too_few(monkeypatch):
-    problems = _experiments(kind=Vectorised, compiled=True)
+    problems = _experiments(2, kind=Vectorised, compiled=True)
     monkeypatch.setattr(members, "ENOUGH", 2 * members.DRAWS + 1)
     told, settings = list[str](), replace(SETTINGS, refine="auto", members=500)
     found = estimate.estimate_jointly(_joint(problems), settings, seed=3, tell=told.append)
@@ -206,7 +206,7 @@ def test_what_is_shared_on_a_bent_line_by_experiments_without_own_quantities():
     weights = density / density.sum()
     exact = np.sqrt(weights @ (a[:, 0] - weights @ a[:, 0]) ** 2)
     settings = replace(SETTINGS, refine="auto", members=500)
-    found = [estimate.estimate_jointly(joint, settings, seed).shared[:, 0].std() for seed in (3, 4, 5)]
+    found = [estimate.estimate_jointly(joint, settings, seed).shared[:, 0].std() for seed in (4, 5)]
     assert 0.8 < np.mean(found) / exact < 1.1
 
 

@@ -73,4 +73,4 @@ def test_an_estimate_made_without_an_odd_data_set_is_examined_too():
 def test_campaigns_drawn_from_the_prior_are_not_doubted():
     """By their quantiles a conflict is told once in 2000 campaigns at most."""
     rng = np.random.default_rng(0)
-    assert not [c for _ in range(40) for c in told(campaign(rng.standard_normal(), rng.standard_normal(SETS), rng))]
+    assert not [c for _ in range(12) for c in told(campaign(rng.standard_normal(), rng.standard_normal(SETS), rng))]

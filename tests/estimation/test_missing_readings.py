@@ -168,7 +168,7 @@ def test_a_chaotic_series_of_fewer_members_than_cells_keeps_its_width():
 NAMES = ("a", "b", "c")
 
 
-def experiments(gaps, count=3):
+def experiments(gaps, count=2):
     found = []
     for e in range(count):
         problem = make_problem(Linear(NAMES), np.array([1.0, -0.5, 0.3 * e]), seed=e)
@@ -180,7 +180,7 @@ def experiments(gaps, count=3):
 
 def joint(gaps, executor=None):
     problems = experiments(gaps)
-    settings = AssimilationSettings(members=60, what_if=False, emulator="off", refine="none")
+    settings = AssimilationSettings(members=30, what_if=False, emulator="off", refine="none")
     shared = JointProblem(tuple(problems), ({"a": "", "b": ""},) * len(problems))
     return estimate_jointly(shared, settings, 1, executor)
 

@@ -21,7 +21,7 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 
 ERRORS, SPREAD, SETS, DRAWS = np.array([0.1, 3.0]), 0.03, 6, 2500
-STEP, COUNT = 0.02, 512
+STEP, COUNT = 0.02, 384
 AXIS = STEP * (np.arange(COUNT) - COUNT // 2)
 A, B = np.meshgrid(AXIS, AXIS, indexing="ij")
 THETAS = np.linspace(-3, 3, 13)

@@ -16,6 +16,7 @@ from test_twin_sweep import CONFIG as RING
 
 import en4dvar
 from en4dvar.cli import main
+from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report import TABLES
 from en4dvar.runs.engine import IDENTITY, KINDS, kind_in, kind_named
@@ -45,7 +46,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Configurations, and a finished campaign of three data sets."""
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "campaign").mkdir()
-    make_campaign(folder / "campaign", 3)
+    make_campaign(folder / "campaign", 3, "execution_models:Swift")
     (folder / "series").mkdir()
     drift_series.write(folder / "series")
     (folder / "ring.yaml").write_text(yaml.safe_dump(RING))
@@ -74,7 +75,12 @@ def test_every_kind_is_tried() -> None:
 
 
 @pytest.mark.parametrize("name", WORKED)
-def test_what_is_written_is_declared(prepared: Path, tmp_path: Path, name: str) -> None:
+def test_what_is_written_is_declared(
+    prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    small = Effort(hyper_walkers=16, hyper_rounds=20, hyper_components=2, draws=200, effective=20.0)  # for the files
+    monkeypatch.setattr("en4dvar.estimation.population.campaign.Effort", lambda: small)
+    monkeypatch.setattr("en4dvar.estimation.population.own._emulated", lambda *of: None)
     out = tmp_path / "out"
     done = call(prepared, *WORKED[name], "--out", out)
     assert done.exit_code == 0, done.output
