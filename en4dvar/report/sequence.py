@@ -190,7 +190,6 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
 
 
 def sequence_figures(data: Group) -> Iterator[Captioned]:
-    """Each figure with its caption."""
     best = "smoothed" if "smoothed_mean" in data else "analysis"
     parameters, state = str(data.attrs["parameters"]).split(", "), list(map(str, data["state"].values))
     held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
@@ -371,7 +370,6 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
 
 
 def twin_figures(data: Group) -> Iterator[Captioned]:
-    """Each figure with its caption."""
     burn_in = int(data.attrs["burn_in"])
     words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)

@@ -53,7 +53,6 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:
-    """Versions of those packages that are installed."""
     versions = {}
     for name in names:
         with suppress(metadata.PackageNotFoundError):
@@ -114,7 +113,6 @@ class Identity:
 
     @functools.cached_property
     def content(self) -> Mapping[str, str]:
-        """``data`` by name."""
         return dict(self.data)
 
     def difference(self, earlier: "Identity", retried: frozenset[str]) -> str:
