@@ -59,10 +59,8 @@ def write_cycles_report(kind: Literal["sequence", "twin"], run_dir: Path, files:
     return write_text(run_dir / "report.html", render(f"{kind}.html.j2", figures=drawn, **shown))
 
 
-write_sequence_report, write_twin_report = (
-    partial(write_cycles_report, "sequence"),
-    partial(write_cycles_report, "twin"),
-)
+write_sequence_report = partial(write_cycles_report, "sequence")
+write_twin_report = partial(write_cycles_report, "twin")
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
