@@ -204,7 +204,8 @@ def shown(value: float, p: Parameter) -> str:
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
     """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std),
-    as those that failed for leaving it, and three times the prior's own share. A lognormal has no bound to pile up at.
+    with those that failed for leaving it. The prior's own share near the bound is no finding, three times it is. A
+    lognormal has no bound.
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
