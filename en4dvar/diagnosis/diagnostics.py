@@ -132,7 +132,6 @@ def active_members(failures: Sequence[str]) -> Mask:
 
 
 def common_reasons(failures: Sequence[str], most: int = 3) -> str:
-    """The most frequent reasons of failure with their counts."""
     counts = Counter(reason for reason in failures if reason)
     return "; ".join(f"{reason} ({count}×)" for reason, count in counts.most_common(most))
 

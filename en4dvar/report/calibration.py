@@ -127,11 +127,8 @@ class Verdict:
         if not self.off:
             return ""
         if self.quantity == ERRORS:
-            size = (
-                "larger than data.error says, or the model is wrong"
-                if self.mean > 0
-                else "smaller than data.error says"
-            )
+            larger = "larger than data.error says, or the model is wrong"
+            size = larger if self.mean > 0 else "smaller than data.error says"
             return f"the errors of the readings are {size} (ranks of the errors)"
         if self.quantity == FIT:
             side = "better" if self.mean > 0 else "worse"

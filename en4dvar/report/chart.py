@@ -146,7 +146,6 @@ class Panel:
         return self.xlim or _around(x, self.x_logarithmic), self.ylim or _around(y, self.logarithmic)
 
     def entries(self) -> list[str]:
-        """Labels of the legend, each once."""
         return list(dict.fromkeys(m.label for m in self.marks if m.label)) if self.legend else []
 
     def x_ticks(self) -> list[tuple[float, str]]:
@@ -154,7 +153,6 @@ class Panel:
         return labelled(self.limits()[0], self.xticks, self.names, self.x_logarithmic, self.whole)
 
     def y_ticks(self) -> list[tuple[float, str]]:
-        """The same along y."""
         return labelled(self.limits()[1], self.yticks, self.y_names, self.logarithmic, False)
 
     def _add(self, kind: Kind, x: Values, y: Values, top: Values, colour: str, size: float, **how: Any) -> None:

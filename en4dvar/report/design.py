@@ -48,7 +48,6 @@ def front(designs: Designs) -> list[DesignRow]:
 
 
 def settings_text(row: DesignRow) -> str:
-    """What the knobs are set to."""
     return ", ".join(f"{name} {value}" for name, value in row.settings.items()) or "as in the file"
 
 
@@ -133,7 +132,6 @@ def design_table(designs: Designs) -> str:
 
 
 def remarks(designs: Designs) -> list[str]:
-    """What to know of the designs beside their worth."""
     failed = [row for row in designs.rows if row.failure]
     rows, told = ranked(designs), []
     if rows and rows[0].evaluated.worth < designs.asked.enough:
@@ -170,7 +168,6 @@ def remarks(designs: Designs) -> list[str]:
 
 
 def gains(designs: Designs) -> Chart:
-    """Information against each knob."""
     names = [*designs.asked.knobs, *["experiments"] * (len({row.evaluated.alike for row in ranked(designs)}) > 1)]
     panels = []
     for name in names:
@@ -189,7 +186,6 @@ def gains(designs: Designs) -> Chart:
 
 
 def prices(designs: Designs) -> Chart:
-    """Information against price, with the front."""
     panel = Panel("price", "information [nats]")
     (x, y), (u, v) = (np.array([(row.price, row.evaluated.worth) for row in of(designs)]).T for of in (ranked, front))
     panel.dots(x, y, "prior", 3.0)

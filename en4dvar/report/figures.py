@@ -1,5 +1,5 @@
-"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide; with them what
-varies in time: rows of a table, and what the evidence says of a change.
+"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide; with them the
+rows of a table of what varies in time.
 """
 
 import math
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.diagnosis.diagnostics import change_words, member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.priors.field_prior import regular_grid
@@ -314,14 +314,6 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     label = str(posterior.variables[name].attrs["long_name"])
     units = pieces.attrs["display_units"], time.attrs["display_units"]
     return StoredWalk(name, label, pieces.attrs["symbol"], *units, shown(time, edges), after, quantiles("prior"))
-
-
-def verdict(result: StoredResult) -> str:
-    """What the evidence says of all that varies, in a sentence; "" where nothing does."""
-    stats = result.group("sample_stats").attrs
-    if "log_evidence_change" not in stats:
-        return ""
-    return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
 
 
 def steps(edges: Array, values: Array) -> tuple[Array, Array]:

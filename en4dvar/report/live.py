@@ -1,7 +1,5 @@
 """What a run at work has told in ``run.log``: where each data set stands, and parameters over the iterations."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.diagnosis.diagnostics import change_words, chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report import responses
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
-from en4dvar.report.figures import all_figures, neighbours, stored_walks, verdict
+from en4dvar.report.figures import all_figures, neighbours, stored_walks
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import Captioned, draw
@@ -39,6 +39,7 @@ def render_set(
     judged, recorded = result.group("sample_stats"), json.loads(str(result.attributes["assimilation_settings"]))
     stats, structured = judged.attrs, any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2, dfs = float(stats["chi2_per_observation"]), float(stats["dfs"])
+    change = (str(stats["varying"]), float(stats["log_evidence_change"])) if "log_evidence_change" in stats else None
     return render(
         "set.html.j2",
         result=result,
@@ -56,7 +57,7 @@ def render_set(
         entries=stored_ledger(result),
         readings=responses.reading_words(result),
         walks=stored_walks(result),
-        verdict=verdict(result),
+        verdict=change_words(*change) if change else "",
         identifiers=IDENTIFIERS,
         drawn={name: (caption, svg) for name, caption, svg in draw(all_figures(result), IDENTIFIERS, folder, begin)},
         judged=judged,

@@ -360,7 +360,6 @@ def medians_table(c: PopulationsCompared) -> str:
 
 
 def figure(c: PopulationsCompared) -> Chart:
-    """The median of each population, one panel a parameter."""
     panels = []
     for name, (low, middle, high) in c.quoted.items():
         p, places = c.parameters[name], -np.arange(float(len(c.populations)))

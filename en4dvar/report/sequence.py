@@ -8,11 +8,12 @@ model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -47,15 +48,19 @@ RANKS = (
 )
 
 
-def write_cycles_page(
-    run_dir: Path, template: str, data: Group, figures: Iterable[Captioned], files: bool, **shown: Any
-) -> Path:
-    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page. ``shown``: also,
-    with ``iterations``: forecasts of the window a cycle, on average.
+def write_cycles_report(kind: Literal["sequence", "twin"], run_dir: Path, files: bool = False) -> Path:
+    """Write ``report.html`` of a sequence or a twin experiment from its result, with ``files`` also figures as PDF and
+    PNG; returns the path of the page. Raises :class:`OutputError`.
     """
+    data = read_groups(run_dir / f"{kind}.nc")["/"]
+    shown, figures = (_scored(data), twin_figures(data)) if kind == "twin" else (_ended(data), sequence_figures(data))
+    shown |= {"attributes": data.attrs, "sizes": data.sizes, "copies": files}
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
-    shown |= {"attributes": data.attrs, "sizes": data.sizes, "figures": drawn, "copies": files}
-    return write_text(run_dir / "report.html", render(template, **shown))
+    return write_text(run_dir / "report.html", render(f"{kind}.html.j2", figures=drawn, **shown))
+
+
+write_sequence_report = partial(write_cycles_report, "sequence")
+write_twin_report = partial(write_cycles_report, "twin")
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
@@ -172,9 +177,7 @@ class SequenceOutcome(SeriesResult):
         return on_paper(chart)
 
 
-def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``sequence.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
-    data = read_groups(run_dir / "sequence.nc")["/"]
+def _ended(data: Group) -> dict[str, Any]:
     at_end = [
         (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
         for name, mean, std, unit in islice(last_analysis(data), LISTED)
@@ -185,12 +188,10 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         size, share = (np.sqrt(np.mean(there**2)), np.mean(np.abs(there) <= 2)) if len(there) else (np.nan, np.nan)
         rows.append((str(name), str(len(there)), plain_number(float(size), 3), percent(float(share))))
     readings, iterations = int(np.isfinite(data["observations"].values).sum()), float(data["iterations"].values.mean())
-    shown = {"readings": readings, "iterations": iterations, "at_end": at_end, "innovations": rows}
-    return write_cycles_page(run_dir, "sequence.html.j2", data, sequence_figures(data), files, **shown)
+    return {"readings": readings, "iterations": iterations, "at_end": at_end, "innovations": rows}
 
 
 def sequence_figures(data: Group) -> Iterator[Captioned]:
-    """Each figure with its caption."""
     best = "smoothed" if "smoothed_mean" in data else "analysis"
     parameters, state = str(data.attrs["parameters"]).split(", "), list(map(str, data["state"].values))
     held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
@@ -357,21 +358,17 @@ class TwinOutcome(TwinResult):
         return on_paper(scores(series_group(self, {})))
 
 
-def write_twin_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``twin.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
-    data = read_groups(run_dir / "twin.nc")["/"]
+def _scored(data: Group) -> dict[str, Any]:
     burn_in = int(data.attrs["burn_in"])
     rows = []  # estimate, RMSE, spread, spread over RMSE after the burn-in
     for kind, _ in _kinds(data):
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
     heads = with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data))
-    shown = {"iterations": float(data["iterations"].values[burn_in:].mean()), "heads": heads, "scores": rows}
-    return write_cycles_page(run_dir, "twin.html.j2", data, twin_figures(data), files, **shown)
+    return {"iterations": float(data["iterations"].values[burn_in:].mean()), "heads": heads, "scores": rows}
 
 
 def twin_figures(data: Group) -> Iterator[Captioned]:
-    """Each figure with its caption."""
     burn_in = int(data.attrs["burn_in"])
     words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)

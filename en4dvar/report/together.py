@@ -112,7 +112,6 @@ def _caption(joint: StoredJoint) -> str:
 
 
 def joint_table(joint: StoredJoint) -> str:
-    """What is shared, for the terminal."""
     rows = [
         (f"{e.name} without {e.without}" if e.without else e.name, e.unit, *estimate_cells(e))
         for e in estimates(joint)
@@ -332,7 +331,6 @@ def _logarithmic(draws: xr.DataArray) -> bool:
 
 
 def population_lines(stored: StoredPopulation) -> Iterator[str]:
-    """What the terminal shows."""
     yield results_table({words: rows for words, rows, _ in summaries(stored)[: len(stored.words)]})
     yield ""
     yield from sentences(stored)
@@ -345,7 +343,6 @@ def population_figure(stored: StoredPopulation) -> str:
 
 
 def caption(stored: StoredPopulation) -> str:
-    """Of the figure."""
     return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
 
 

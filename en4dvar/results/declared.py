@@ -84,7 +84,6 @@ class Declared:
         return first.group(1) if first else ""
 
     def of(self, subject: Any, item: Item) -> Variable:
-        """The variable of an item."""
         values = self.values(subject) if item is ONCE else self.values(subject, item)
         about = {**self.unit.attributes(subject, item), "long_name": self.meaning.format(label=item.label)}
         dims = tuple(self.dims.format(**item.names).split())
@@ -105,7 +104,6 @@ Table = Sequence[Declared]
 
 
 def lay_out(table: Table, subject: Any, scopes: Scopes) -> dict[str, Variable]:
-    """The variables that a subject has, by name."""
     variables = {}
     for declared in table:
         for item in scopes[declared.scope](subject) if declared.scope else (ONCE,):
@@ -125,7 +123,6 @@ def group_of(
 
 
 def attributes_of(table: Iterable[Attribute], subject: Any) -> dict[str, Any]:
-    """The attributes that a subject has."""
     values: dict[str, Any] = {}
     for declared in table:
         value = declared.value(subject)
@@ -175,5 +172,4 @@ class Axis:
 
 
 def axes_of(names: Sequence[str]) -> tuple[Axis, ...]:
-    """Of the series of a data set."""
     return tuple(Axis(name, len(names) == 1) for name in names)

@@ -99,12 +99,10 @@ class Group:
 
     @property
     def every(self) -> dict[str, Variable]:
-        """Variables and coordinates."""
         return {**self.variables, **self.coords}
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Length of every dimension."""
         return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
 
     def check(self) -> None:
@@ -277,14 +275,12 @@ def define_variable(
 
 
 def tree_of(groups: Groups) -> xr.DataTree:
-    """All groups, by path."""
     import xarray as xr
 
     return xr.DataTree.from_dict({path: dataset_of(group) for path, group in groups.items()})
 
 
 def dataset_of(group: Group) -> xr.Dataset:
-    """One group."""
     import xarray as xr
 
     def shown(v: Variable) -> xr.Variable:

@@ -268,7 +268,6 @@ class Alike:
 
 
 def packed(groups: Groups) -> bytes:
-    """The bytes of the groups."""
     numbers = bytearray()
     words: list[Any] = []
     layout = []

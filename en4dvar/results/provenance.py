@@ -54,7 +54,6 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:
-    """Versions of those packages that are installed."""
     versions = {}
     for name in names:
         with suppress(metadata.PackageNotFoundError):
@@ -115,13 +114,10 @@ class Identity:
 
     @functools.cached_property
     def content(self) -> Mapping[str, str]:
-        """``data`` by name."""
         return dict(self.data)
 
     def difference(self, earlier: "Identity", retried: frozenset[str]) -> str:
         """Unified diff from ``earlier`` to this, "" where they agree. Files of ``retried`` data sets may differ."""
-        if self == earlier:
-            return ""
 
         def lines(identity: Identity) -> list[str]:
             data = [f"{name}: {'' if name in retried else content}" for name, content in identity.data]

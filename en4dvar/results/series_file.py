@@ -226,7 +226,6 @@ def estimates(result: SeriesResult) -> list[tuple[str, float, float, str]]:
 
 
 def sequence_csv(result: SeriesResult) -> str:
-    """State and parameters at the last time as CSV."""
     rows = [[name, f"{mean:.8g}", f"{std:.6g}", unit] for name, mean, std, unit in estimates(result)]
     return csv_text([["variable", "mean", "std", "unit"], *rows])
 

@@ -192,12 +192,10 @@ def posterior_file(run_dir: str | Path) -> Path:
     path = Path(run_dir) / "posterior.nc"
     require_settled(path.parent)
     if not path.is_file():
-        tables = [
-            f"{path.parent / kind}.csv" for kind in ("joint", "population") if path.with_name(f"{kind}.nc").exists()
-        ]
-        words = f"what several data sets say together is in {' and '.join(tables)}"
-        asked = words if tables else "is it the directory of a finished run?"
-        raise OutputError(f"{run_dir}: holds no posterior.nc; {asked}")
+        of_several = [name for name in ("joint", "population") if path.with_name(f"{name}.nc").exists()]
+        tables = " and ".join(f"{path.parent / name}.csv" for name in of_several)
+        said = f"what several data sets say together is in {tables}" if tables else ""
+        raise OutputError(f"{run_dir}: holds no posterior.nc; {said or 'is it the directory of a finished run?'}")
     return path
 
 

@@ -167,7 +167,6 @@ class StoredGroups:
 
     @property
     def datasets(self) -> tuple[str, ...]:
-        """Names of the data sets."""
         return tuple(map(str, self.group("alone")["dataset"].values))
 
     @property
@@ -181,7 +180,6 @@ class StoredGroups:
         return self.cautions
 
     def group(self, name: str) -> xr.Dataset:
-        """The variables of a group."""
         return self.tree.children[name].to_dataset()
 
     @classmethod
@@ -343,7 +341,6 @@ class StoredPopulation(StoredGroups):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters of the population."""
         return tuple(str(self.tree.attrs["parameters"]).split())
 
     @property

@@ -91,10 +91,9 @@ class ClosingDraws(Importance):
         n = self.z.shape[1]
         if np.isfinite(self.log_weights).sum() <= 2 * (n + 1):
             return self.first
-        power, shares = 1.0, shares_of(self.tempered)
-        while (effective := effective_number(shares)) < SETTLED and power > 1e-4:
+        power, logs = 1.0, self.tempered
+        while (effective := effective_number(shares := shares_of(power * logs))) < SETTLED and power > 1e-4:
             power *= 0.8
-            shares = shares_of(power * self.tempered)
         where = resampled(shares, min(2 * self.count, MOST_FITTED), self.stream)
         parts = max(1, min(PARTS, int(effective / (EACH * n))))
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)

@@ -104,12 +104,14 @@ def sample(
     emulated: EmulatedCost | None = None,
     proposal: StudentMixture | None = None,
 ) -> Chain:
-    """Sample a density from the neighbourhood of an ensemble; the same seed gives the same bits. ``log_density``: of
-    positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time. ``ensemble`` (N, n):
-    walkers start from its members, slightly scattered. ``walkers``: raised to an even number of at least 2 (n + 1).
-    ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``: called with what
-    each look at convergence shows. ``emulated``: guides the walkers, which start from draws of it. ``proposal``: covers
-    all modes; walkers jump to draws of it. Raises En4dvarError: the density vanishes at (nearly) every member.
+    """Sample a density from the neighbourhood of an ensemble; the same seed gives the same bits.
+
+    ``log_density``: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
+    ``ensemble`` (N, n): walkers start from its members, slightly scattered. ``walkers``: raised to an even number of at
+    least 2 (n + 1). ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``:
+    called with what each look at convergence shows. ``emulated``: guides the walkers, which start from draws of it.
+    ``proposal``: covers all modes; walkers jump to it. Raises En4dvarError: the density vanishes at (nearly) every
+    member.
     """
     import emcee  # a twentieth of a second that most runs do not need
 

@@ -54,7 +54,6 @@ class WeightedDraws:
 
     @property
     def lowest(self) -> float:
-        """J of the lowest draw."""
         return float(self.costs.min())
 
     @property

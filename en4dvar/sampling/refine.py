@@ -91,18 +91,19 @@ def examine_tails(
     drawn: Drawn | None = None,
 ) -> dict[str, float]:
     """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
-    is printed; nothing of an ensemble without a covariance. By members of J known by their forecast ``after``, those of
-    the prior by that ``before``, runs along each parameter and, ``always`` or where these leave a doubt, as many runs
-    :data:`FAR` times as far out as the members. Points are weighted with the density that they are drawn from, for the
-    posterior and for that of the ensemble, which is Gaussian unless it was ``drawn`` otherwise: where it is the
-    posterior both weights are the same. ``tail_shift`` is the largest distance of both means in posterior standard
-    deviations, ``tail_ratio`` the standard deviation of the ensemble over the posterior's where that is farthest from
-    1, ``tail_excess`` by how many standard errors of theirs a distance or ratio is beyond :data:`SHIFT` or
-    :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter that is surely off by what is
-    warned of, NaN where ``tail_members``, the effective number of the points, is below :data:`TOO_FEW`.
-    ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest ``off`` of
-    :func:`~en4dvar.sampling.ends.examine_ends`, and ``tail_q05_<name>``, ``tail_q95_<name>`` are its points of a
-    parameter where that is what is warned of.
+    is printed; nothing of an ensemble without a covariance.
+
+    By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
+    and, ``always`` or where these leave a doubt, as many runs :data:`FAR` times as far out as the members. Points are
+    weighted with the density that they are drawn from, for the posterior and for that of the ensemble, which is
+    Gaussian unless it was ``drawn`` otherwise: where it is the posterior both weights are the same. ``tail_shift`` is
+    the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard deviation of the
+    ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard errors of theirs a
+    distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of
+    a parameter that is surely off by what is warned of, NaN where ``tail_members``, the effective number of the points,
+    is below :data:`TOO_FEW`. ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is
+    the largest ``off`` of :func:`~en4dvar.sampling.ends.examine_ends`, and ``tail_q05_<name>``, ``tail_q95_<name>`` are
+    its points of a parameter where that is what is warned of.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):

@@ -38,7 +38,6 @@ class Case:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Those it is about."""
         return tuple(p for p in self.a.parameters if p.name in self.caution.parameters)
 
     @property

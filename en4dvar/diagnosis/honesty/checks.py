@@ -15,6 +15,7 @@ from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
+from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, PriorTerm
 
@@ -120,22 +121,20 @@ def missed(analysis: Analysis) -> Findings:
     if amplitude is None or amplitude.name not in names:
         return
     low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
-    error = float(np.median(analysis.own_std))
-    if low > THERE * error:
-        least, most, noise = (shown(size, amplitude) for size in (low, high, error))
+    error, part = float(np.median(analysis.own_std)), analysis.problem.parts[0].where
+    if not low > THERE * error:
+        return
+    signal = float(np.std(analysis.observations.values[part][analysis.observations.weights[part] > 0]))
+    by = f"by {shown(low, amplitude)} to {shown(high, amplitude)} (standard deviation of the discrepancy, 5 to 95 %)"
+    if low > NOTHING * signal:
         words = (
-            f"the model misses the readings by {least} to {most} (standard deviation of the discrepancy, 5 to 95 %), "
-            f"beside errors of {noise}: the intervals allow for what shows in the residuals, not for what the "
-            "parameters have absorbed"
+            f"the model explains little: it misses the readings {by}, while these vary by {shown(signal, amplitude)}"
         )
-        part = analysis.problem.parts[0].where
-        signal = float(np.std(analysis.observations.values[part][analysis.observations.weights[part] > 0]))
-        if low > NOTHING * signal:
-            words = (
-                f"the model explains little: it misses the readings by {least} to {most} (standard deviation of the "
-                f"discrepancy, 5 to 95 %), while these vary by {shown(signal, amplitude)}"
-            )
-        yield caution("discrepancy-found", words, SERIOUS if low > NOTHING * signal else None)
+        yield caution("discrepancy-found", words, SERIOUS)
+    else:
+        words = f"the model misses the readings {by}, beside errors of {shown(error, amplitude)}"
+        absorbed = "the intervals allow for what shows in the residuals, not for what the parameters have absorbed"
+        yield caution("discrepancy-found", f"{words}: {absorbed}")
 
 
 def moments(analysis: Analysis) -> list[str]:
@@ -205,7 +204,8 @@ def shown(value: float, p: Parameter) -> str:
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
     """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std),
-    as those that failed for leaving it, and three times the prior's own share. A lognormal has no bound to pile up at.
+    with those that failed for leaving it. The prior's own share near the bound is no finding, three times it is. A
+    lognormal has no bound.
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
@@ -338,13 +338,9 @@ def down_weighted(analysis: Analysis) -> Findings:
         return
     lighter, moment, within = np.flatnonzero(weights < 1), moments(analysis), analysis.observations.noise.counts_within
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{moment[k]} (weight {weights[k]:.2g})" for k in worst[:MOST_LISTED])
-    more = f" and {len(worst) - MOST_LISTED} more" if len(worst) > MOST_LISTED else ""
-    words = (
-        f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations and "
-        f"were down-weighted (Huber): at {listed}{more} {CLOCK}"
-    )
-    yield caution("down-weighted", words)
+    where = listed((f"{moment[k]} (weight {weights[k]:.2g})" for k in worst), MOST_LISTED)
+    beyond = f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations"
+    yield caution("down-weighted", f"{beyond} and were down-weighted (Huber): at {where} {CLOCK}")
 
 
 def weighted(analysis: Analysis) -> Findings:

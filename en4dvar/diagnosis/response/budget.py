@@ -24,9 +24,7 @@ TOLD = 0.03  # share from which a source is named
 
 
 def shares_of_priors(covariance: Array, prior_variance: Array) -> Array:
-    """(n, n): the share of parameter i's variance that comes from the prior of parameter j, both (n, n), (n,)
-    transformed.
-    """
+    """(n, n): share of the variance of i by the prior of j, from ``covariance`` and prior variance, transformed."""
     return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
 
 
