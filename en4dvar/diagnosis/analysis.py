@@ -22,12 +22,13 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """Diagnostics of one iteration (glossary of the field). Parameters are physical, SI. ``cost = background +
-    observation`` is J of the central trajectory at the iterate that *starts* the iteration; the last record is the
-    accepted end point. ``step_norm`` is the undamped step there in posterior standard deviations, ``step_length`` the
-    accepted fraction of it (0: no move). ``members`` (N, n) is the ensemble that the scheme's weights and transform
-    describe at that iterate. ``active`` counts the members whose forecast succeeded; it is N where fewer runs gave the
-    tangent and none failed.
+    """Diagnostics of one iteration (glossary of the field). Parameters are physical, SI.
+
+    ``cost = background + observation`` is J of the central trajectory at the iterate that *starts* the iteration;
+    the last record is the accepted end point. ``step_norm`` is the undamped step there in posterior standard
+    deviations, ``step_length`` the accepted fraction of it (0: no move). ``members`` (N, n) is the ensemble that the
+    scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast
+    succeeded; it is N where fewer runs gave the tangent and none failed.
     """
 
     iteration: int
@@ -55,8 +56,9 @@ class ChainRecord:
 
 @dataclass(frozen=True)
 class StartRecord:
-    """Where the descents stand that decide where the iterations start: rounds of moves, J of each descent, and how many
-    are under way. ``further``: the number of the round of descents after these, that look for another minimum, from 1.
+    """Where the descents stand that decide where the iterations start: rounds of moves, J of each descent, and how
+    many are under way. The moves of the lowest become the first iterations. ``further``: the number of the round of
+    descents after these, that look for another minimum, from 1.
     """
 
     rounds: int
@@ -67,10 +69,12 @@ class StartRecord:
 
 @dataclass(frozen=True)
 class Descents:
-    """Where all descents of one data set ended. ``members`` (D,) of the prior ensemble from which they started, -1 for
-    its mean, -2 for a draw beyond the ensemble; ``minimum`` (D,) the number of the minimum of J in which each ended, 0
-    is the lowest and -1 none, since the model failed; ``costs`` of the minima; ``spread``, by how much J of those in
-    the lowest differs; forward ``runs`` of the search after the first descents.
+    """Where all descents of one data set ended.
+
+    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean, -2 for a draw beyond the ensemble;
+    ``minimum`` (D,) the number of the minimum of J in which each ended, 0 is the lowest and -1 none, since the model
+    failed; ``costs`` of the minima; ``spread``, by how much J of those in the lowest differs; forward ``runs`` of the
+    search after the first descents.
     """
 
     members: tuple[int, ...]
@@ -114,9 +118,10 @@ Progress = Callable[[str, Record], None]  # what hears of them, with the name of
 @dataclass(frozen=True)
 class Discrepancy:
     """The part of the observations that the model misses, given the residual at the centre: ``mean`` and ``std`` (K,)
-    in the observable's unit. ``shares`` (n, 3) divide the posterior variance of each parameter, transformed and in the
-    linear approximation at the centre, into what comes from the readings' errors, from the discrepancy, and from the
-    prior; rows sum to 1.
+    in the observable's unit.
+
+    ``shares`` (n, 3) divide the posterior variance of each parameter, transformed and in the linear approximation at
+    the centre, into what comes from the readings' errors, from the discrepancy, and from the prior; rows sum to 1.
     """
 
     mean: Array
@@ -130,9 +135,10 @@ BEYOND_5 = 1.6449  # standard deviations beyond which 5 % of a Gaussian lie
 @dataclass(frozen=True)
 class Mode:
     """A minimum of J with some of the probability: J there, how many descents from different members ended in it, by
-    how much J of these differs, and its weight in the posterior. ``centre``, ``q05`` and ``q95`` (n,) are the median of
-    the draws that belong to it, and 5 and 95 % of them, where the posterior was sampled; else the minimum, and those of
-    the Gaussian about it. Physical, SI.
+    how much J of these differs, and its weight in the posterior.
+
+    ``centre``, ``q05`` and ``q95`` (n,) are the median of the draws that belong to it, and 5 and 95 % of them, where
+    the posterior was sampled; else the minimum, and those of the Gaussian about it. Physical, SI.
     """
 
     centre: Array

@@ -68,6 +68,8 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
 def change_words(names: str, log_factor: float) -> str:
     """The verdict of the evidence on parameters that vary, in words: ``log_factor`` is ln p(y | they vary) − ln p(y |
     constant).
+
+    Where they are constant, a Bayes factor of :data:`DECISIVE` or more comes up in at most one set of data in as many.
     """
     if math.isnan(log_factor):
         return f"the evidence for a change of {names} is not known: no fit with constant values could be made"
@@ -88,9 +90,10 @@ def chi2_interval(degrees: float, tail: float = TAIL) -> tuple[float, float]:
 
 
 def effective_share(log_weights: Array) -> float:
-    """Effective sample size of importance weights relative to their number: 1 where all are equal. ``log_weights`` (B,)
-    up to a constant, −inf for none. The √B largest are cut to the smallest of them (Ionides 2008, J. Comput. Graph.
-    Stat. 17, 295), which keeps one draw in a tail from deciding.
+    """Effective sample size of importance weights relative to their number: 1 where all are equal.
+
+    ``log_weights`` (B,) up to a constant, −inf for none. The √B largest are cut to the smallest of them (Ionides 2008,
+    J. Comput. Graph. Stat. 17, 295), which keeps one draw in a tail from deciding.
     """
     cap = np.sort(log_weights)[-max(3, math.isqrt(len(log_weights)))]
     weights = np.exp(np.minimum(log_weights, cap) - cap)
@@ -98,10 +101,11 @@ def effective_share(log_weights: Array) -> float:
 
 
 def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]:
-    """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members. ``members`` (N, n)
-    and the ``centre`` (n,) of their Gaussian, transformed; ``costs`` J (N,) of the members. With log weights ½ z² − J,
-    z the distance in the ensemble's covariance, the :func:`effective_share` of the weights is 1 for a Gaussian
-    posterior. NaN with fewer members alive than n + 2.
+    """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
+
+    ``members`` (N, n) and the ``centre`` (n,) of their Gaussian, transformed; ``costs`` J (N,) of the members. With log
+    weights ½ z² − J, z the distance in the ensemble's covariance, the :func:`effective_share` of the weights is 1 for a
+    Gaussian posterior. NaN with fewer members alive than n + 2.
     """
     alive = np.isfinite(costs)
     anomalies = members - centre
@@ -137,10 +141,11 @@ def common_reasons(failures: Sequence[str], most: int = 3) -> str:
 
 
 def member_quantiles(values: Array, levels: Sequence[float], axis: int | None = None) -> Any:
-    """Quantiles (L, …) of what the members along ``axis`` are draws of; NaN is no member. The p-quantile lies at the
-    place p (N + 1/4) + 3/8 among N members in order, where a Gaussian's is on average (Blom 1958, *Statistical
-    Estimates and Transformed Beta-Variables*). Interpolation between the smallest and the largest, numpy's default,
-    made 90 % intervals of 48 members that hold 86 to 88 % of truths (``en4dvar calibrate``).
+    """Quantiles (L, …) of what the members along ``axis`` are draws of; NaN is no member.
+
+    The p-quantile lies at the place p (N + 1/4) + 3/8 among N members in order, where a Gaussian's is on average (Blom
+    1958, *Statistical Estimates and Transformed Beta-Variables*). Interpolation between the smallest and the largest,
+    numpy's default, made 90 % intervals of 48 members that hold 86 to 88 % of truths (``en4dvar calibrate``).
     """
     if np.isnan(values).any():  # one instant after the other
         return np.nanquantile(values, levels, axis=axis, method=METHOD)

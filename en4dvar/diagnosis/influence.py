@@ -10,8 +10,8 @@ independent, are told by importance weights: leaving reading k out changes the p
 the members, weighted by it, stand for the posterior without k (Gelfand, Dey & Chang 1992). The largest weights become
 quantiles of a generalised Pareto distribution fitted to them, whose shape k̂ tells whether the weighted mean is to be
 believed (Vehtari, Simpson, Gelman, Yao & Gabry 2024, J. Mach. Learn. Res. 25, 72; fit: Zhang & Stephens 2009,
-Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). Elsewhere the influence is not known without a
-fit that lacks the reading.
+Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). Elsewhere the influence is not known
+without a fit that lacks the reading.
 """
 
 import math
@@ -66,8 +66,9 @@ class ReadingTangent:
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of K readings on n parameters: the change of the posterior mean if one reading is left out. ``change``
-    (n, K), physical and SI, NaN where it cannot be told; ``in_std`` (n, K) in posterior standard deviations.
+    """Influence of K readings on n parameters: the change of the posterior mean if one reading is left out.
+
+    ``change`` (n, K), physical and SI, NaN where it cannot be told; ``in_std`` (n, K) in posterior standard deviations.
     ``pareto_shape`` (K,) is k̂, NaN without weights; ``how`` (K,) is 0 by importance weights, 1 by the tangent, 2 where
     it is not known without a fit that lacks the reading.
     """
@@ -114,7 +115,11 @@ def _parts(k: int, draws: int) -> Iterator[slice]:
 
 
 def believed_shape(draws: int) -> float:
-    """k̂ below which a mean weighted over so many draws is to be believed."""
+    """k̂ below which a mean weighted over so many draws is to be believed.
+
+    >>> round(believed_shape(48), 3), believed_shape(4000)
+    (0.405, 0.7)
+    """
     return min(BELIEVED, 1 - 1 / math.log10(max(draws, 2)))
 
 

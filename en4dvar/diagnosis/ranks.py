@@ -1,4 +1,5 @@
 r"""Are the ranks of truths among posterior members uniform? Simulation-based calibration, tested on its distribution.
+
 Where a truth is drawn from the prior and readings from the model, its rank among N members of the posterior takes each
 of the N + 1 places with the same chance, whatever the readings tell (Cook, Gelman & Rubin 2006, J. Comput. Graph. Stat.
 15, 675; Talts et al. 2018, arXiv:1804.06788). Of S sets the number with a rank below k is then binomial, of the chance

@@ -134,13 +134,14 @@ class Residuals:
     @cached_property
     def outlier(self) -> tuple[int, float]:
         """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
+
         Of u = Q^{-1/2}e, ν independent normal numbers for a covariance Q of rank ν, each studentised residual is a
         projection, so that its square over uᵀu is Beta(½, (ν − 1)/2); times K for the largest of them (Bonferroni).
         Readings far more exact than the prior leave Q no variance in the directions that the parameters fit. In those
         that mostly the prior lets vary, u says how much wider than the truth the prior is: a square counts as one, and
         residuals are those without these directions. Where the size of the errors is estimated, a posterior of more
-        squares than u has takes the place of uᵀu; one of fewer, as beside a discrepancy, knows less of the scatter than
-        u does, and does not.
+        squares than u has, which are u and what the prior knows of that size, takes the place of uᵀu. One of fewer,
+        as beside a discrepancy, knows less of the scatter than u does, and does not.
         """
         from scipy.special import betainc, digamma
 
@@ -168,7 +169,11 @@ class Residuals:
 
 
 def positive_chance(weights: Array) -> float:
-    """P(Σ λ_k z_k² > 0) of independent normal z for weights λ (K,), by Imhof's integral."""
+    """P(Σ λ_k z_k² > 0) of independent normal z for weights λ (K,), by Imhof's integral.
+
+    >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
+    (0.5, 0.7071)
+    """
     scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u
     u = FREQUENCIES
     angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)

@@ -42,10 +42,11 @@ COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "members", "cautions
 
 @dataclass(frozen=True)
 class Judged:
-    """What came of one set: of Q quantities, the parameters and the fit of the readings, ``numbers`` (Q, 7). A row
-    holds :data:`NUMBERS`: truth and quantiles of :data:`LEVELS` in display units; the distance z of the truth from the
-    mean in standard deviations, in the prior's own transform; its rank among the ``members``. All are NaN where there
-    is no truth. ``cautions``: codes of the serious ones. ``failure``: why there is no posterior.
+    """What came of one set: of Q quantities, the parameters and the fit of the readings, ``numbers`` (Q, 7).
+
+    A row holds :data:`NUMBERS`: truth and quantiles of :data:`LEVELS` in display units; the distance z of the truth
+    from the mean in standard deviations, in the prior's own transform; its rank among the ``members``. All are
+    NaN where there is no truth. ``cautions``: codes of the serious ones. ``failure``: why there is no posterior.
     """
 
     number: int

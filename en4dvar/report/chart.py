@@ -1,7 +1,8 @@
 """What a figure shows, free of how it is drawn: panels in rows, marks in panels, round numbers for the axes, colours.
-One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`, PDF
-and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of :data:`LIGHT`
-or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
+
+One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`,
+PDF and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of
+:data:`LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
 """
 
 import math
@@ -24,10 +25,11 @@ Values = npt.ArrayLike
 
 @dataclass(frozen=True)
 class Mark:
-    """``x`` and ``y`` (n,) in the panel's units, ``top`` (n,) of what has a lower and an upper edge. ``size``: width of
-    a line, diameter of a dot. ``dash``: "", "--" or ":". Marks of one ``label`` are one entry of the legend. A ``rule``
-    lies at ``y``, an ``upright`` at ``x`` up to 85 % of the height; a ``span`` reaches from ``y`` to ``top``. ``tiles``
-    are rectangles about ``x`` and ``y``, whose width and height are ``top``.
+    """``x`` and ``y`` (n,) in the panel's units, ``top`` (n,) of what has a lower and an upper edge.
+
+    ``size``: width of a line, diameter of a dot. ``dash``: "", "--" or ":". Marks of one ``label`` are one entry of the
+    legend. A ``rule`` lies at ``y``, an ``upright`` at ``x`` up to 85 % of the height; a ``span`` reaches from ``y`` to
+    ``top``. ``tiles`` are rectangles about ``x`` and ``y``, whose width and height are ``top``.
     """
 
     kind: Kind
@@ -53,9 +55,11 @@ class Mark:
 
 @dataclass
 class Panel:
-    """Two axes and what is drawn between them. ``xticks``, ``yticks``: how many intervals at most, or the ticks
-    themselves; ``names``, ``y_names``: words in place of their numbers. A ``title`` may have several lines. ``bare``:
-    nothing but ``words``, in the middle. Limits that are None follow the marks.
+    """Two axes and what is drawn between them.
+
+    ``xticks``, ``yticks``: how many intervals at most, or the ticks themselves; ``names``, ``y_names``: words in place
+    of their numbers. A ``title`` may have several lines. ``bare``: nothing but ``words``, in the middle. Limits
+    that are None follow the marks.
     """
 
     xlabel: str = ""
@@ -287,7 +291,11 @@ GREYS = ("#ffffff", "#bdbdbd", "#636363", "#000000")
 
 
 def ramp(anchors: Sequence[str], share: float) -> str:
-    """The colour at a ``share`` of the way along ``anchors``."""
+    """The colour at a ``share`` of the way along ``anchors``.
+
+    >>> ramp(GREYS, 0.0), ramp(GREYS, 1.0)
+    ('#ffffff', '#000000')
+    """
     place = min(max(share, 0.0), 1.0) * (len(anchors) - 1)
     first = min(int(place), len(anchors) - 2)
     low, high = (bytes.fromhex(code[1:]) for code in anchors[first : first + 2])

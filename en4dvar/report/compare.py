@@ -54,10 +54,11 @@ STORED = "* as the result has it: Laplace's approximation, unless its posterior 
 
 @dataclass(frozen=True)
 class ModelScore:
-    """One run on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows. ``difference`` is the
-    log-evidence minus that of the best model; NaN, as ``probability``, where the runs used different data. ``stored``:
-    the log-evidence is the result's, not sampled. ``warnings`` are the codes of its warnings, and ``doubted`` those for
-    which neither its intervals nor its evidence are to be trusted.
+    """One run on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows.
+
+    ``difference`` is the log-evidence minus that of the best model; NaN, as ``probability``, where the runs used
+    different data. ``stored``: the log-evidence is the result's, not sampled. ``warnings`` are the codes of its
+    warnings, and ``doubted`` those for which neither its intervals nor its evidence are to be trusted.
     """
 
     run: str

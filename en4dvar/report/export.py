@@ -1,5 +1,6 @@
-"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper. netCDF needs no export:
-``posterior.nc`` follows the ArviZ schema as it is.
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper.
+
+netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 """
 
 import itertools
@@ -203,13 +204,21 @@ def latex_symbol(row: ParameterSummary) -> str:
 
 
 def is_math(text: str) -> bool:
-    r"""Whether ``text`` is one formula between dollars that does nothing but print."""
+    r"""Whether ``text`` is one formula between dollars that does nothing but print.
+
+    >>> is_math(r"$\mu_{max}$"), is_math(r"$\frac{1}{2}R^2$"), is_math(r"$\input{x}$"), is_math("$a}b{c$")
+    (True, True, False, False)
+    """
     depths = list(itertools.accumulate((c == "{") - (c == "}") for c in text))
     return bool(_FORMULA.fullmatch(text)) and min(depths) == 0 == depths[-1]
 
 
 def latex_unit(unit: str) -> str:
-    r"""``"um"`` → ``$\mu$m``, ``"J/m^2"`` → ``J/m$^{2}$``, ``"1"`` → nothing."""
+    r"""``"um"`` → ``$\mu$m``, ``"J/m^2"`` → ``J/m$^{2}$``, ``"1"`` → nothing.
+
+    >>> latex_unit("um"), latex_unit("Pa s"), latex_unit("m s-1"), latex_unit("%"), latex_unit("1")
+    ('$\\mu$m', 'Pa\\,s', 'm\\,s$^{-1}$', '\\%', '')
+    """
     if unit == "1":
         return ""
     text = escaped(unit).replace("\\^{}", "^")

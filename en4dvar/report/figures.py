@@ -1,5 +1,5 @@
-"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide; with them the
-rows of a table of what varies in time.
+"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide; with them what
+varies in time: rows of a table, and what the evidence says of a change.
 """
 
 import math

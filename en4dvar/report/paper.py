@@ -1,5 +1,6 @@
-"""A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it. Only this module
-draws with matplotlib, whose import takes longer than all charts of a page: each function does it.
+"""A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it.
+
+Only this module draws with matplotlib, whose import takes longer than all charts of a page: each function does it.
 """
 
 from __future__ import annotations
@@ -102,7 +103,9 @@ def _panel(ax: Axes, panel: Panel) -> None:
 
 
 def _legends(figure: Figure, chart: Chart) -> None:
-    """Each legend above its panel; the only one of a row above all of its panels, several in one column each."""
+    """Each legend above its panel; where a row has several panels and one legend, above all of them, and where it has
+    several legends, in one column: one that is wider than its panel would leave the panels no room.
+    """
     axes = iter(figure.axes)
     for row in chart.rows:
         drawn = [(next(axes), panel) for panel in row.panels if not panel.bare or panel.words]

@@ -51,6 +51,7 @@ CAPTION = (
 class Difference:
     """The median of one parameter in ``first`` against that in ``second``: 5, 50 and 95 % of their ratio (NaN where the
     prior allows values of both signs) and of their difference in ``unit``; ``greater``: probability that the first is.
+
     ``apart`` (3,): the quantiles of ratio or difference if nothing were common. ``untrusted``: codes of warnings.
     """
 
@@ -250,7 +251,9 @@ def _calibrated(
     name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values],
     off: Mapping[str, Mapping[str, float]], median: Array, alone: Array | None,
 ) -> Iterator[str]:  # fmt: skip
-    """What groups that are known do to the median (M, K) of the others; ``alone``: the same were nothing common."""
+    """What groups that are known from elsewhere, ``off`` from their own data, do to the median (M, K) of a parameter in
+    the others; ``alone``: the same were nothing common, None where nothing is.
+    """
     known = [label for label, of_it in off.items() if any(by <= TOO_FAR for by in of_it.values())]
     for k, (label, s) in enumerate(stored.items()):
         parameter = s.prior_of(name).parameter

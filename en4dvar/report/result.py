@@ -30,8 +30,9 @@ FEWEST_DRAWS = 4  # of a chain: ArviZ's diagnostics need as many
 
 class Result(StoredResult):
     """The posterior of one data set through xarray; figures are matplotlib's, in display units.
-    ``posterior["G"].values[0]`` are the members (N,) of G, SI, NaN where one failed. What xarray shows is a view: a
-    change of it changes neither the figures nor what :meth:`save` writes.
+
+    ``posterior["G"].values[0]`` are the members (N,) of G, SI, NaN where one failed. What xarray shows is a view:
+    a change of it changes neither the figures nor what :meth:`save` writes.
     """
 
     @cached_property

@@ -1,7 +1,8 @@
-"""A chart as an ``<svg>`` element of a page: words as words, symbols slanted, colours as CSS variables. The entries of
-a legend carry the label of their marks: with the page's script they are switched on and off, and a panel says where the
-pointer is. One coordinate in ten of a point is kept. Lines of more points than can be seen are thinned to the extremes
-of each part and dots on the same spot are drawn once, so that 10⁵ readings make no page of megabytes.
+"""A chart as an ``<svg>`` element of a page: words as words, symbols slanted, colours as CSS variables.
+
+The entries of a legend carry the label of their marks: with the page's script they are switched on and off, and a panel
+says where the pointer is. One coordinate in ten of a point is kept. Lines of more points than can be seen are thinned
+to the extremes of each part and dots on the same spot are drawn once, so that 10⁵ readings make no page of megabytes.
 """
 
 import math

@@ -34,7 +34,11 @@ def upper_first(words: str) -> str:
 
 
 def pretty_unit(unit: str) -> str:
-    """``"um"`` → ``"µm"``, ``"Pa s"`` → ``"Pa·s"``, ``"J/m^2"`` → ``"J/m²"``, ``"1"`` → ``""``."""
+    """``"um"`` → ``"µm"``, ``"Pa s"`` → ``"Pa·s"``, ``"J/m^2"`` → ``"J/m²"``, ``"1"`` → ``""``.
+
+    >>> pretty_unit("um"), pretty_unit("Pa s^0.6"), pretty_unit("J/m^2"), pretty_unit("1"), pretty_unit("m s-1")
+    ('µm', 'Pa·s^0.6', 'J/m²', '', 'm·s⁻¹')
+    """
     if unit == "1":
         return ""
     text = re.sub(r"(?<![A-Za-z])u(?=[A-Za-z])", "µ", unit.strip())
@@ -65,14 +69,22 @@ def plain_number(value: float, digits: int = 4) -> str:
 
 
 def rough_number(value: float) -> str:
-    """Two significant digits, as people write them; an en dash for NaN."""
+    """Two significant digits, as people write them; an en dash for NaN.
+
+    >>> rough_number(287.4), rough_number(1.333), rough_number(6.18e6)
+    ('290', '1.3', '6.2×10⁶')
+    """
     if not math.isfinite(value) or not 1 <= abs(value) < 1e4:
         return plain_number(value, 2)
     return plain_number(float(f"{value:.2g}"))
 
 
 def number_like(value: float, std: float) -> str:
-    """``value`` rounded to the precision that ``std`` allows."""
+    """``value`` rounded to the precision that ``std`` allows.
+
+    >>> number_like(2.80123, 0.104), number_like(-0.0, 0.1), number_like(float("nan"), 1.0)
+    ('2.80', '0.00', '–')
+    """
     places = max(0, 1 - math.floor(math.log10(std))) if std > 0 and math.isfinite(std) else 3  # two digits of the std
     if not math.isfinite(value):
         return "–"
@@ -110,7 +122,11 @@ def untrusted_words(row: ParameterSummary) -> str:
 
 
 def signed(value: float) -> str:
-    """Two significant digits with their sign."""
+    """Two significant digits with their sign.
+
+    >>> signed(0.234), signed(-4.0)
+    ('+0.23', '−4')
+    """
     return ("+" if value > 0 else "") + plain_number(value, 2)
 
 
@@ -120,7 +136,11 @@ def percent(share: float) -> str:
 
 
 def fixed(value: float, places: int) -> str:
-    """A number of so many decimals; an en dash for NaN."""
+    """A number of so many decimals; an en dash for NaN.
+
+    >>> fixed(-1.25, 1), fixed(-0.01, 1)
+    ('-1.2', '0.0')
+    """
     return f"{value:z.{places}f}" if math.isfinite(value) else "–"
 
 
@@ -158,7 +178,11 @@ def figure_text(name: str) -> str:
 
 
 def symbol_html(symbol: str) -> Markup:
-    r"""A mathtext symbol as HTML: Greek letters, sub- and superscripts; everything else is escaped text."""
+    r"""A mathtext symbol as HTML: Greek letters, sub- and superscripts; everything else is escaped text.
+
+    >>> str(symbol_html(r"$\mu$")), str(symbol_html(r"$R_{\mathrm{eq}}$")), str(symbol_html("<b>"))
+    ('<i>μ</i>', '<i>R</i><sub>eq</sub>', '&lt;b&gt;')
+    """
     if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
         return escape(symbol)
     tags = {"_": "sub", "^": "sup", "": "i"}
@@ -167,7 +191,11 @@ def symbol_html(symbol: str) -> Markup:
 
 
 def math_pieces(body: str) -> list[tuple[str, str]]:
-    r"""What stands between two dollar signs: ("", base), ("_", index) and ("^", exponent) in order."""
+    r"""What stands between two dollar signs: ("", base), ("_", index) and ("^", exponent) in order.
+
+    >>> math_pieces(r"R_{\mathrm{eq}}")
+    [('', 'R'), ('_', 'eq')]
+    """
     body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
     body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], m[1]), body)

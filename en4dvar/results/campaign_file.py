@@ -1,7 +1,8 @@
-"""``posterior.nc`` of a campaign: the results of its data sets side by side along the dimension ``dataset``. It is
-written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the ArviZ
-schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and the
-observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
+"""``posterior.nc`` of a campaign: the results of its data sets side by side along the dimension ``dataset``.
+
+It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
+ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
+the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
 observations, the iterations, the descents and the modes stay in ``datasets.pack``.
 """
 
@@ -75,6 +76,7 @@ def save_campaign(
 ) -> Path:
     """Write the campaign's file; one that is there already, of the same results, is left as it is. ``sources``: name of
     the data set → its name in the ``pack``, in order, not empty; ``failures``: name of one without a posterior → why.
+
     Raises :class:`DamagedError`: results cannot be read. :class:`OutputError`: the file cannot be written.
     """
     digests = [pack.entries[stem].content_digest for stem in sources.values()]
@@ -126,7 +128,9 @@ def datasets_in(path: Path) -> list[str]:
 
 
 def _said(path: Path, damaged: bool = False) -> dict[str, Any]:
-    """Attributes of the root, names of data sets; nothing of no file or, if it may be ``damaged``, of such a one."""
+    """Attributes of the root, and the names of the data sets; nothing where there is no file or, if it may be
+    ``damaged``, where it cannot be read. Raises :class:`OutputError`.
+    """
     try:
         return dict(netcdf.read_sealed(said_in, path)) if path.is_file() else {}
     except OutputError:

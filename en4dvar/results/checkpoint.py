@@ -54,8 +54,9 @@ def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
 
 @dataclass
 class Keeper:
-    """Keeps the latest state of a computation in a file, flushed to the disk, at most every ``every`` seconds, and so
-    seldom that writing takes a twentieth of the time; with ``every`` 0 each one is.
+    """Keeps the latest state of a computation in a file, flushed to the disk: neither a kill nor a loss of power takes
+    more than what was done since. It is written at most every ``every`` seconds, and so seldom that writing takes a
+    twentieth of the time; with ``every`` 0 each one is.
     """
 
     path: Path

@@ -1,6 +1,7 @@
 """Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values. The
-declarations say what is written, what is asked of a file that is read, and the reference page of the documentation. A
-name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
+declarations say what is written, what is asked of a file that is read, and the reference page of the documentation.
+
+A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
 """
 
@@ -64,7 +65,8 @@ ALWAYS = When("", lambda _, item: True)
 @dataclass(frozen=True)
 class Declared:
     """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item. ``values``: of a subject and,
-    where the name has a placeholder, of an item. ``needed``: no result is without it. Else as of ``netcdf.Variable``.
+    where the name has a placeholder, of an item. ``needed``: no result is without it. ``fill`` and ``single`` as of
+    :class:`~en4dvar.results.netcdf.Variable`.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Groups of variables ⇄ NETCDF4 files, several times faster than through xarray, whose import takes as long as an
 estimate; :func:`tree_of` and :func:`dataset_of` show them through it.
 
-All definitions come before all data, so that HDF5 lays out its metadata once. The encoding is xarray's own (NaN as fill
+All definitions come before all data: HDF5 then lays out its metadata once. The encoding is xarray's own (NaN as fill
 value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings). A file is made in memory:
 a worker far away can do it, and a file system is touched once.
 
@@ -169,8 +169,10 @@ def read_groups(path: Path) -> dict[str, Group]:
 
 
 def read_sealed(reader: Callable[..., Iterator[Any]], path: Path, *arguments: Any) -> list[Any]:
-    """What ``reader(path, *arguments)``, a function of a module, gives of a sealed file. Over some the library crashes
-    or never ends, so what others have sealed is read by another process. Raises :class:`OutputError`.
+    """What ``reader(path, *arguments)``, a function of a module, gives of a sealed file.
+
+    Anybody can seal a file, and there are some over which the library crashes or never ends. So what this process has
+    not written itself is read by another one, within limits. Raises :class:`OutputError`.
     """
     if check_seal(path):
         return list(reader(path, *arguments))

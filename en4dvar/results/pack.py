@@ -107,6 +107,9 @@ def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
 def file_names(names: Iterable[str]) -> dict[str, str]:
     """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there:
     blanks and signs become ``_``; names that differ only in case or accents' encoding get a number.
+
+    >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
+    {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
     """
     used: set[str] = set()
     chosen = {}
@@ -172,7 +175,9 @@ def _read(path: Path, name: str, begin: int, size: int, expected: str) -> bytes:
 
 
 def _scan(path: Path) -> tuple[dict[str, Entry], int, bool]:
-    """The records by name, where the last of them ends, and whether there is nothing else."""
+    """The records by name, where the last of them ends, and whether there is nothing else. Where no record follows
+    another, the next line is looked for from that one's own line on: bytes may have gone.
+    """
     entries: dict[str, Entry] = {}
     end = place = looked = 0
     whole = True
@@ -234,7 +239,8 @@ _ALIGNED = 8  # bytes
 @dataclass(frozen=True, eq=False)
 class PackedLayout:
     """Which variables there are: of each group the path, then of its variables and of its coordinates the name and what
-    :func:`_place` tells; texts ``named`` along dimensions, ``sizes`` by path, words of ``texts``, ``length`` in bytes.
+    :func:`_place` tells; ``named``: which texts stand along dimensions; ``sizes`` of these by path; ``texts``: how many
+    words each has; ``length`` of the numbers in bytes.
     """
 
     groups: list[tuple[str, list[Any], list[Any]]]

@@ -33,6 +33,7 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
     """ACDD and provenance attributes of a result; what cannot be found out (no git, an installed package) is "".
+
     ``config_text``: the configuration, verbatim; ``config_path``: its file, of which the commit is recorded;
     ``command``: what the user typed, for ``history``.
     """

@@ -1,5 +1,6 @@
-"""The results of a run directory: those that are there, and by name those that ought to be, by the lines of its pack,
-``checkpoints/run`` and ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
+"""The results of a run directory: those that are there, and by name those that ought to be, which is known from three
+places: the lines of its pack, ``checkpoints/run`` and ``posterior.nc``. Whichever is damaged, no data set vanishes
+without a word.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,6 +1,9 @@
 """A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema.
-Errors of readings and paths have groups of their own beside those of ArviZ, whose tools take every variable of the
-observed data for one that is predicted. A file is checked for what a result consists of, for anybody can seal one.
+
+Errors of readings and paths have groups of their own beside those of ArviZ: tools take every variable of the observed
+data for one that is predicted, and every dimension of the predictions for one of the readings.
+
+A file that is read is checked for what a result consists of, also behind a good seal, for anybody can seal a file.
 """
 
 import math

@@ -121,7 +121,9 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
 
 
 def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
-    """Observations and bands of each data set, without the odd ones but of these, in display units, padded with NaN."""
+    """Observations and bands of each data set, padded with NaN, in display units; and each against all others. Bands
+    are those without the odd data sets, but of these.
+    """
     experiments, agreed = estimate.joint.experiments, estimate.agreement
     most = max(len(experiment.observations) for experiment in experiments)
     times, values = np.full((2, len(experiments), most), np.nan)

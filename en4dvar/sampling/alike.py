@@ -1,5 +1,8 @@
-"""Few draws of a posterior that stand for all of them, exchanged until they have nearly the same moments and quantiles:
-they miss means by a hundredth of a std, where forty-eight draws at random miss them by a seventh.
+"""Few draws of a posterior that stand for all of them, exchanged until they have the same moments and quantiles.
+
+Forty-eight draws at random miss means by a seventh of a standard deviation and standard deviations by a tenth. A linear
+map onto the moments of all draws mends that, but leads off a posterior that is bent: readings fit such members worse
+than they fit draws. Exchanged draws miss means by a hundredth, standard deviations by a few hundredths, and are draws.
 """
 
 import numpy as np
@@ -13,8 +16,10 @@ LEAST = 500  # at least so many
 
 
 def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covariance: Array) -> Array:
-    """(N, n) of equally likely draws ``x`` (D, n), of nearly this mean (n,) and covariance (n, n): the ``chosen`` (N,)
-    ones, exchanged for others of the same ``kind`` (D,) as long as that helps. Where too few differ, the chosen ones.
+    """(N, n) of equally likely draws ``x`` (D, n), of nearly this mean (n,) and covariance (n, n).
+
+    They are the ``chosen`` (N,) ones, exchanged for others of the same ``kind`` (D,) as long as that brings moments and
+    quantiles nearer to those of all. Where too few differ, the chosen ones.
     """
     n = x.shape[1]
     if len(chosen) <= n or np.linalg.matrix_rank(x[chosen] - x[chosen].mean(axis=0)) < n:

@@ -2,10 +2,11 @@ r"""A stand-in for J that costs nothing to evaluate: J of predictions emulated b
 
     m_k(x) ≈ Σ_a c_ka z^a,   z = W (x − x̄),   |a| ≤ degree
 
-Within a posterior predictions bend little, so that a cubic fitted to a few hundred runs gives J to a few tenths where
-it varies by tens. The fit is weighted towards runs of low J and made twice: first at draws of the Gaussian posterior,
-then with runs where the first emulator says the posterior is. The share of those runs that importance weights exp(Ĵ −
-J) leave effective says how far Ĵ can be trusted.
+Within a posterior predictions bend little, so that a few hundred runs tell them to a small part of the observation
+error. J is a sum of squares of residuals, and a cubic fitted to these runs gives it to a few tenths where J itself
+varies by tens. The fit is weighted towards runs of low J and made twice: first at draws of the Gaussian posterior, then
+with runs where the first emulator says the posterior is. The share of those runs that importance weights exp(Ĵ − J)
+leave effective says how far Ĵ can be trusted.
 
 Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comput. Phys. 6, 826; sampling where the
 surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
@@ -75,8 +76,9 @@ class Emulator(NamedTuple):
     def fitted(
         cls, coordinates: Coordinates, degree: int, x: Array, outputs: Array, counts: Array, ridge: float
     ) -> "Emulator":
-        """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,). ``ridge`` is
-        relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
+        """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,).
+
+        ``ridge`` is relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
         """
         parents = monomials(x.shape[1], degree)
         matrix = np.ascontiguousarray(basis(coordinates.of(x), parents).T)
@@ -94,8 +96,9 @@ class Emulator(NamedTuple):
 
 
 def monomials(n: int, degree: int) -> npt.NDArray[np.int64]:
-    """(M, 2) of the monomials in n coordinates up to ``degree``, in order of degree; the first is 1. Monomial j is
-    monomial ``[j, 0]`` times coordinate ``[j, 1]``.
+    """(M, 2) of the monomials in n coordinates up to ``degree``, in order of degree; the first is 1.
+
+    Monomial j is monomial ``[j, 0]`` times coordinate ``[j, 1]``.
     """
     index: dict[tuple[int, ...], int] = {(): 0}
     parents = [(0, 0)]
@@ -120,8 +123,10 @@ def basis(z: Array, parents: npt.NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True)
 class Bend:
-    """x ↦ ln(1 + exp(x − ``about``)) of those coordinates (n,) of which ``about`` is no NaN, logarithms: what a
-    positive parameter does vanishes with it, and so does the slope of this, while a polynomial of the logarithm grows.
+    """x ↦ ln(1 + exp(x − ``about``)) of those coordinates (n,) of which ``about`` is no NaN.
+
+    They are the logarithms of what acts on the predictions: what a positive parameter does vanishes with it, and so
+    does the slope of this, while a polynomial of the logarithm grows.
     """
 
     about: Array
@@ -142,9 +147,12 @@ class Bend:
 @dataclass(frozen=True)
 class EmulatedCost:
     """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``, a polynomial of what
-    ``bend`` makes of them, stacked as those of ``make``. J_o is cut at ``ceiling``: far from its runs a polynomial says
-    only that J is large, and a walker that true J lets in there must find its way out. ``share`` is the effective share
-    of the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ).
+    ``bend`` makes of them.
+
+    J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
+    in there must find its way out. All of the prior at that J_o has about e^−20 of the posterior's probability.
+    ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ). Outputs are stacked as
+    those of ``make``.
     """
 
     emulator: Emulator
@@ -162,7 +170,9 @@ class EmulatedCost:
         return np.minimum(observed, self.ceiling) + self.prior.cost(x)
 
     def settled(self, random: np.random.Generator) -> "EmulatedCost":
-        """With draws after :data:`LONGER` more rounds; of a bent posterior those before were up to 40 % too narrow."""
+        """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
+        moves from a Gaussian were up to 40 % too narrow.
+        """
         walkers = len(self.draws) // (SETTLED - SETTLED // 3)
         positions = self.walk(self.draws[-walkers:], self.draws, random, LONGER)
         return replace(self, draws=np.concatenate(positions[LONGER // 3 :]))
@@ -211,8 +221,11 @@ def needed_runs(n_parameters: int) -> tuple[int, int] | None:
 def emulate(
     run: Run, prior: Prior, observations: Observations, ensemble: Array, random: np.random.Generator, fits: int = 2
 ) -> EmulatedCost | None:
-    """Ĵ about a Gaussian ensemble (N, n), transformed, with draws of it; each of the ``fits`` takes the
-    :func:`needed_runs`. None where there are too many parameters for polynomials, or too many runs fail.
+    """Ĵ about a Gaussian ensemble (N, n), transformed, with draws of it.
+
+    Each of the ``fits`` takes the :func:`needed_runs` of the model through ``run``, from the second on where the one
+    before says the posterior is. None where there are too many parameters for polynomials, or so many runs fail that
+    the rest does not determine them.
     """
     n = ensemble.shape[1]
     wanted = needed_runs(n)

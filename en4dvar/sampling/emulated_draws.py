@@ -2,10 +2,11 @@ r"""A proposal that is the emulated posterior itself, for posteriors that are to
 
     x_i ~ exp(−Ĵ/τ),   w_i = exp(Ĵ(x_i)/τ − J(x_i)),   ∫ exp(−J) dx = ∫ exp(−Ĵ/τ) dx · E[w]
 
-Where ten parameters are tied together to some thousandths of their spread, a mixture keeps 2 to 5 % of its draws
-effective and loses the tails. Of J of quadratic predictions tens of thousands of draws can be made, of which 10 to 60 %
-stay effective under the model. The emulator is fitted to all runs made so far, and learns where it is wrong from runs
-at its own draws, first hot (τ > 1), so that they reach beyond the runs before them.
+Where ten parameters are tied together to some thousandths of their spread, a mixture fitted to a few hundred draws
+keeps 2 to 5 % of its draws effective and loses the tails. Predictions bend far less than J does, and J of quadratic
+predictions costs microseconds: of it tens of thousands of draws can be made, which show the whole of that valley, and
+10 to 60 % of them stay effective under the model. The emulator is fitted to all runs made so far, and learns where it
+is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyond the runs before them.
 
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
@@ -77,10 +78,11 @@ class RecordedRuns:
 
 @dataclass(frozen=True)
 class EmulatedProposal:
-    """exp(−Ĵ/τ), normalised by exp(``log``), in the coordinates z in which the prior is N(0, 1). ``walkers`` (W, n)
-    sample it. From a ``mixture`` to the first proposal, and from proposal to proposal, they are drawn by the ratio of
-    both densities, in steps that leave half of them effective, and move in each (Del Moral, Doucet & Jasra 2006, J. R.
-    Stat. Soc. B 68, 411).
+    """exp(−Ĵ/τ), normalised by exp(``log``), in the coordinates z in which the prior is N(0, 1).
+
+    ``walkers`` (W, n) sample it. From a ``mixture`` to the first proposal, and from proposal to proposal, they are
+    drawn by the ratio of both densities, in steps that leave half of them effective, and move in each (Del Moral,
+    Doucet & Jasra 2006, J. R. Stat. Soc. B 68, 411).
     """
 
     cost: Callable[[Array], Array]
@@ -132,8 +134,9 @@ class EmulatedProposal:
         return replace(self, cost=cost, walkers=z)
 
     def settled(self, stream: np.random.Generator) -> "EmulatedProposal":
-        """After moves of the walkers, and draws of a mixture in the place of some, which go from end to end of a thin
-        valley (iterated sampling importance resampling: Andrieu, Lee & Vihola 2018, Bernoulli 24, 842).
+        """After moves of the walkers, and with draws of a mixture about them in the place of those that their weights
+        say: small moves do not take them from end to end of a thin valley (iterated sampling importance resampling:
+        Andrieu, Lee & Vihola 2018, Bernoulli 24, 842).
         """
         z = _moved(self.cost, self.walkers, self.walkers, stream)
         mixture = StudentMixture.fitted(z, stream, PARTS)

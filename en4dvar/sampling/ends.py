@@ -39,8 +39,9 @@ Costs = list[dict[float, float]]
 
 
 class Intervals(NamedTuple):
-    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed; by how much the 5 or 95 % point of members
-    and of what they are drawn from is ``off`` (n,), in its std; whether J ``rises`` to all points at :data:`END`.
+    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point both of
+    what members are drawn from and of them is off (n,), in posterior standard deviations: members alone may be by
+    chance, and are what is printed. Whether J ``rises`` to all points at :data:`END`.
     """
 
     quantiles: Array
@@ -49,7 +50,11 @@ class Intervals(NamedTuple):
 
 
 class _Walk:
-    """Along each parameter, to both sides of a minimum; ``costs``: J − ln V by the distance in standard deviations."""
+    """Along each parameter j, to both sides, from a minimum; ``runs`` are there.
+
+    ``costs`` of each side are J − ln V (relative to that at the minimum) by the distance in standard deviations, and
+    those of what members are ``drawn`` from likewise, if that is no Gaussian.
+    """
 
     def __init__(self, space: WeightSpace, minimum: Minimum, runs: ModelRuns, drawn: Drawn | None):
         self.space, self.runs, self.start, self.drawn, n = space, runs, minimum.x, drawn, len(minimum.x)
@@ -127,7 +132,11 @@ class _Walk:
         return [side for side in sides if self.rise(side, far) < 0.5 * END**2 - SHORT]
 
     def density(self, j: int, sides: Costs) -> tuple[Array, Array]:
-        """Distances (P,) along parameter j, shares (P,) of its density: √(2 (J − min J)) is interpolated."""
+        """Distances (P,) along parameter j and shares (P,) of its density there, from costs of all ``sides``.
+
+        Between the points √(2 (J − min J)) is interpolated, which is the distance itself where J is quadratic; beyond
+        the last, as far again, it goes on as before.
+        """
         distances, roots = [0.0], [0.0]
         for sign, costs in zip((-1, 1), sides[2 * j : 2 * j + 2], strict=True):
             far = sorted(costs)

@@ -7,8 +7,9 @@ all before, and q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 20
 Coordinates z are those in which the prior is N(0, 1).
 
 Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
-none of them lies nothing tells that something is missing. So :class:`ClosingDraws` fits its proposals to a power of the
-posterior; what judges the posterior are :class:`FixedDraws` of the last proposal alone: their mean weight is unbiased.
+none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power
+of the posterior, with covariances that few draws do not make flat; what judges the posterior are :class:`FixedDraws` of
+the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
 import numpy as np
@@ -26,8 +27,10 @@ Proposal = StudentMixture | EmulatedProposal
 
 
 class Importance:
-    """Draws ``z`` (D, n) from proposals, ``count`` in a round, the first of them from ``first``; ``log_weights`` (D,)
-    are their weights, ``log`` is ln ∫ L N dz and ``effective`` the number of draws behind it.
+    """The draws of one data set from its proposals, ``count`` in a round, the first of them from ``first``.
+
+    ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
+    of draws behind it.
     """
 
     def __init__(self, first: Proposal, stream: np.random.Generator, count: int):
@@ -64,7 +67,9 @@ class Importance:
 
 
 class ClosingDraws(Importance):
-    """Proposals fitted each round to the posterior to the power of ``wider``⁻²; a Gaussian is wider by that factor."""
+    """A proposal each round, fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that
+    factor, and of another shape most where that has tails, so that thin tails are found as well.
+    """
 
     def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float):
         super().__init__(first, stream, count)
@@ -100,8 +105,9 @@ class ClosingDraws(Importance):
 
 
 class FixedDraws(Importance):
-    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``. Source:
-    Ionides (2008), J. Comput. Graph. Stat. 17, 295.
+    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``.
+
+    Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.
     """
 
     def add(self, z: Array, log_likelihood: Array) -> None:

@@ -1,15 +1,17 @@
 """Refinement by Markov chain Monte Carlo: the posterior ensemble as the first positions of an ensemble sampler.
 
 Walkers move by differential evolution (ter Braak 2006, Stat. Comput. 16, 239) and stretches (Goodman & Weare 2010,
-Commun. Appl. Math. Comput. Sci. 5, 65), half of them at a time. The chain is lengthened until it has mixed (split
-R-hat, effective sample size: Gelman et al. 2013, Bayesian Data Analysis, § 11.4-11.5) and thinned to the ensemble.
+Commun. Appl. Math. Comput. Sci. 5, 65), half of them at a time, so that a step is two calls of the forward model. The
+chain is lengthened until it has mixed (split R-hat, effective sample size: Gelman et al. 2013, Bayesian Data Analysis,
+§ 11.4-11.5) and thinned to the size of the ensemble.
 
-With an emulator of the density most steps are guided: a walker makes many moves on the emulator, and the end point is
-accepted on the density itself, so that the chain samples it exactly whatever the emulator is worth (surrogate
-transition method: Liu 2001, Monte Carlo Strategies in Scientific Computing, § 9.4.3).
+With an emulator of the density most steps are guided: a walker makes many moves on the emulator, which costs no run of
+the model, and the end point is accepted on the density itself, so that the chain samples it exactly whatever the
+emulator is worth (surrogate transition method: Liu 2001, Monte Carlo Strategies in Scientific Computing, § 9.4.3).
 
 Where the posterior has several modes, walkers start in all of them and half of the steps are jumps to independent draws
-of a mixture that covers them (Tierney 1994, Ann. Stat. 22, 1701).
+of a mixture that covers them (Tierney 1994, Ann. Stat. 22, 1701). R-hat compares walkers of different modes, so that it
+is near 1 only where jumps were accepted often enough to tell the weights.
 
 emcee's snooker move is not used: with 48 walkers in 5 dimensions it gave standard deviations 30 % too small.
 """
@@ -41,8 +43,11 @@ ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start
 
 @dataclass(frozen=True)
 class Chain:
-    """``samples`` (steps, walkers, n) after burn-in, split R-hat and ``effective`` sample size (n,); by how much the
-    mean ``moved`` (n,) from the ensemble, in posterior std, and the std ``widened`` (n,), as a ratio.
+    """The sampler's output: ``samples`` (steps, walkers, n) after burn-in and the numbers that judge it.
+
+    ``r_hat`` and ``effective`` (n,) are split R-hat and effective sample size; ``moved`` (n,) is the change of the
+    mean against the ensemble it started from in posterior standard deviations, ``widened`` (n,) the ratio of the
+    standard deviations.
     """
 
     samples: Array
@@ -60,8 +65,9 @@ class Chain:
         return np.asarray(self.samples.reshape(-1, self.samples.shape[-1]))
 
     def thin(self, n_members: int, exact: bool = False) -> Array:
-        """(N, n) draws, evenly spaced over the chain, walkers in turn. ``exact``: nearly of the moments and quantiles
-        of the whole chain, see :mod:`~en4dvar.sampling.alike`.
+        """(N, n) draws, evenly spaced over the chain, walkers in turn.
+
+        ``exact``: nearly of the moments and quantiles of the whole chain, see :mod:`~en4dvar.sampling.alike`.
         """
         steps, walkers, _ = self.samples.shape
         count = max(POOL * n_members, LEAST) if exact else n_members
@@ -104,14 +110,16 @@ def sample(
     emulated: EmulatedCost | None = None,
     proposal: StudentMixture | None = None,
 ) -> Chain:
-    """Sample a density from the neighbourhood of an ensemble; the same seed gives the same bits.
+    """Sample a density from the neighbourhood of an ensemble.
 
     ``log_density``: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
-    ``ensemble`` (N, n): walkers start from its members, slightly scattered. ``walkers``: raised to an even number of at
-    least 2 (n + 1). ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``:
-    called with what each look at convergence shows. ``emulated``: guides the walkers, which start from draws of it.
-    ``proposal``: covers all modes; walkers jump to it. Raises En4dvarError: the density vanishes at (nearly) every
-    member.
+    ``ensemble``: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered. ``seed``: of
+    the walkers; the same seed gives the same bits. ``walkers``: at least 2 (n + 1), even. ``max_steps``: at most.
+    ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``: called with what
+    each look at convergence shows. ``emulated``: an approximation at no cost; it guides the walkers, which start from
+    draws of it. ``proposal``: covers all modes; walkers jump to draws of it.
+
+    Raises En4dvarError: the density vanishes at (nearly) every member.
     """
     import emcee  # a twentieth of a second that most runs do not need
 
@@ -204,8 +212,10 @@ def _jump(proposal: StudentMixture) -> Callable[[Array, Any], tuple[Array, Array
 
 
 def split_r_hat(samples: Array) -> Array:
-    """Split R-hat (n,) of chains (steps, chains, n): √(V/W) over half chains; 1 where all agree. Walkers are no
-    independent chains, but drift shows. Source: Gelman et al. (2013), § 11.4.
+    """Split R-hat (n,) of chains (steps, chains, n): √(V/W) over half chains; 1 where all agree.
+
+    Walkers of one ensemble sampler are not independent chains; each half of each is compared with the others all the
+    same, which shows drift. Source: Gelman et al. (2013), § 11.4.
     """
     half = len(samples) // 2
     chains = np.concatenate([samples[:half], samples[half : 2 * half]], axis=1)
@@ -216,9 +226,10 @@ def split_r_hat(samples: Array) -> Array:
 
 
 def effective_sample_size(samples: Array) -> Array:
-    """Effective number of independent draws (n,) in chains (steps, chains, n), for the mean. steps · chains / τ with τ
-    = 1 + 2 Σ ρ_t, ρ_t the autocorrelation averaged over the chains and about the common mean, summed while pairs ρ_{2t}
-    + ρ_{2t+1} are positive and decreasing (Geyer 1992, Stat. Sci. 7, 473).
+    """Effective number of independent draws (n,) in chains (steps, chains, n), for the mean.
+
+    steps · chains / τ with τ = 1 + 2 Σ ρ_t, ρ_t the autocorrelation averaged over the chains and about the common mean,
+    summed while pairs ρ_{2t} + ρ_{2t+1} are positive and decreasing (Geyer 1992, Stat. Sci. 7, 473).
     """
     steps, chains, n = samples.shape
     centred = samples - samples.mean(axis=(0, 1))

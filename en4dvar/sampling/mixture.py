@@ -46,6 +46,7 @@ def fit_gaussians(
     x: Array, rng: np.random.Generator, components: int, rounds: int, alike: float = 0.0, widest: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n); expectation maximisation.
+
     Covariances are drawn towards that of all points, of a size that M parts of it have, as if ``alike`` more points of
     each component said so: its mode under the inverse Wishart prior (Fraley & Raftery 2007, J. Classif. 24, 155).
     ``widest`` (n,): standard deviations of independent coordinates; no component exceeds these in any direction.

@@ -1,5 +1,7 @@
-"""The posterior as a mixture of its modes: draws about every minimum that descents ended in, and the prior, with
-importance weights against J, so that the weight of a mode is its share of the evidence, whatever its shape.
+"""The posterior as a mixture of its modes: weighted draws about every minimum that descents ended in, and the prior.
+
+Importance weights against J correct what the Gaussians about the minima are not, so that the weight of a mode is its
+share of the evidence, whatever its shape.
 """
 
 import math
@@ -39,9 +41,10 @@ Cost = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class WeightedDraws:
-    """Draws (D, n) of a posterior, transformed, their ``shares`` (D,), the ``mode`` (D,) of each by :func:`belonging`,
-    J, ``costs`` (D,), ln ∫ exp(−J_o) N(x) dx, the lowest, ``best`` (n,), and a mixture that resembles them,
-    ``proposal``.
+    """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one.
+
+    ``mode`` (D,) is the number of the minimum that each draw belongs to, see :func:`belonging`, ``costs`` (D,) its J,
+    ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw, ``proposal`` a mixture that resembles them.
     """
 
     x: Array
@@ -71,8 +74,9 @@ class WeightedDraws:
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
-        """(N, n) equally likely ones, of every mode as many as its weight says, to one. ``exact``: nearly of the
-        moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
+        """(N, n) equally likely ones, of every mode as many as its weight says, to one.
+
+        ``exact``: nearly of the moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
         """
         vectors = np.linalg.eigh(self.covariance)[1]
         order = np.lexsort(((self.x - self.mean) @ vectors[:, -1], self.mode))
@@ -87,10 +91,12 @@ def sample_modes(
     cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None, below: float = -np.inf
 ) -> WeightedDraws:
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
-    long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value. Rounds of draws from proposals that close
-    in on the posterior tell the proposal of those that count: a mixture, or where that keeps too few of its draws and
-    ``cost`` has recorded what the runs gave, the emulated posterior. ``cost``: J (B,) of control vectors (B, n), with
-    the prior's own mean and covariance, +inf where the model fails.
+    long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
+
+    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count: a mixture, or
+    where that keeps too few of its draws and ``cost`` has recorded what the runs gave, the emulated posterior.
+    ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
+    Deterministic in ``seed``.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
     most, closing = math.ceil(LAST_RUNS * enough / DRAWS), _closing(n)
@@ -152,7 +158,9 @@ def typical_runs(n: int, enough: float | None) -> int:
 def _guided(
     runs: RecordedRuns, mixed: Importance, mixture: StudentMixture, more: Callable[[Importance], bool]
 ) -> tuple[Importance, StudentMixture, bool]:
-    """Draws of the emulated posterior, or the ``mixed`` ones if better; a mixture about them; whether to go on."""
+    """A round of draws of the emulated posterior, after others that train the emulator, or ``mixed``, those of a
+    mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
+    """
     start: StudentMixture | EmulatedProposal = mixture
     share, of_mixture = 0.0, mixed.effective / len(mixed.z)
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
@@ -192,8 +200,8 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> Indices:
 
 
 def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, for_one: float = 1.0) -> Indices:
-    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to; a group of draws without a minimum
-    has a number beyond them. ``for_one``: how many of a chain are worth one draw.
+    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to, each of those in its own group; a
+    group in which there is none has a number beyond them. ``for_one``: how many of a chain are worth one draw.
     """
     mode, new = np.zeros(len(x), dtype=np.intp), len(minima)
     if not minima:
@@ -209,9 +217,11 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, 
 
 
 def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
-    """Numbers of the draws (D, n), with ``shares`` (D,), of each group: gaps of one coordinate lie between them,
-    :data:`GAP` times as wide as ``beside`` effective draws to either side, and empty but for :data:`NOTHING`. Of a
-    density with one peak such a gap has a chance below 1e-4.
+    """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
+
+    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density
+    with one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less
+    than :data:`NOTHING` leave it empty.
     """
     order = np.argsort(shares, kind="stable")
     held = np.zeros(len(x), dtype=bool)
@@ -247,7 +257,12 @@ def _gap(values: Array, shares: Array, beside: float) -> float | None:
 
 
 def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
-    """Minima (D,) on whose side of the valley between them draws (D, n) lie; if there is none the lower one."""
+    """Numbers (D,) of the minima on whose side of the valley between them draws (D, n) with ``shares`` (D,) lie, and
+    where there is none all that of the lower one.
+
+    Which Gaussian is densest says only where to look: far from all minima, along a bent posterior, it is an accident of
+    how wide they are.
+    """
     mode = nearest(prior, minima, x)
     for j in range(1, len(minima)):
         for i in range(j):
@@ -259,7 +274,9 @@ def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array
 
 
 def _beyond_valley(x: Array, first: Array, second: Array) -> Mask:
-    """Which draws (D, n) lie beyond the emptiest place between those of ``first`` and ``second``; none if filled."""
+    """Which draws (D, n) lie beyond the place that has fewest, on the way from those with shares ``first`` (D,) to
+    those with shares ``second`` (D,), along the direction that tells them apart best; none where the way is filled.
+    """
     both = first + second
     a, b = (shares @ x / shares.sum() for shares in (first, second))
     apart = x - both @ x / both.sum()

@@ -34,8 +34,10 @@ MANY = 500  # readings of other errors than Gaussian ones of known ratios, of wh
 
 
 def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
-    """Members (N, n) in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,), all transformed. None
-    where predictions linear in x say the same, or these are too many, unknown in some direction, or of a mixture.
+    """Members (N, n) in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,), all transformed.
+
+    None where predictions that are linear in x say the same, where these are too many or not known in all directions,
+    and where the posterior is a mixture of its own: beside an estimated discrepancy or scale of what varies.
     """
     problem, prior = space.problem, space.problem.prior
     mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)
@@ -78,7 +80,9 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
 def _cost_of_readings(
     observations: Observations, at: Predicted, slopes: Array
 ) -> Callable[[Array, Array], Array] | None:
-    """J_o (B,) of changes (B, n) from the prediction ``at`` the mode and of σ (B,); None where it takes too long."""
+    """J_o (B,) of changes (B, n) from the prediction ``at`` the mode, by ``slopes`` (n, K) and beside them those of the
+    rates, and of σ (B,); None where it takes too long.
+    """
     like = replace(at, noise_scale=None).each(lambda part: np.asarray(part)[None])
     if observations.noise.quadratic and like.rates is None:
         rows = observations.whitened_rows(np.vstack([slopes, observations.values - at.values]), like)[0]

@@ -1,7 +1,8 @@
 """When an ensemble about one minimum of J leaves a doubt, and the sampled posterior that takes its place.
 
-The members' own J clear most runs. Where they do not, and the model is cheap, an emulator of J is fitted about the
-ensemble and sampled: its mean and standard deviations are those of the posterior within about a tenth
+The members' own J, known from the posterior forecast, clear most runs. Where they do not, and the model is cheap, an
+emulator of J is fitted about the ensemble and sampled: its mean and standard deviations are those of the posterior
+within about a tenth, and what they differ from the ensemble's is what a Markov chain would find
 (benchmarks/gaussianity.py). A Gaussian that is too narrow draws no member where the tails of the posterior are, and a
 tangent does not see what is elsewhere: members of the prior may, and as many runs twice as far out as members, or
 along a way on which J hardly rises. Weighted, they tell mean and spread of any model.
@@ -59,11 +60,14 @@ OVERLAP = "no action is needed: mean ± std describe the members"
 def examine_shape(
     space: WeightSpace, ensemble: Array, shape: Mapping[str, float], seed: int, settle: bool = True
 ) -> dict[str, float]:
-    """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer. Of the ``ensemble`` (N, n),
-    transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members. ``settle``: a doubt of the
-    emulator's is looked into with more moves of its walkers. Where an emulator was needed there are the numbers of
-    :func:`_off`, ``emulator_fit``, and ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical
-    and SI.
+    """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
+
+    Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
+    Deterministic in ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
+    Where an emulator was needed there are ``mean_shift``, the largest distance of the ensemble's mean from the
+    posterior's in posterior standard deviations, ``spread_ratio``, the standard deviation of the ensemble over the
+    posterior's where that is farthest from 1, ``emulator_fit``, and
+    ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
     """
     numbers = dict(shape)
     if shape["gaussian_fit"] < CLEARED:
@@ -91,19 +95,23 @@ def examine_tails(
     drawn: Drawn | None = None,
 ) -> dict[str, float]:
     """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
-    is printed; nothing of an ensemble without a covariance.
+    is printed.
 
     By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
-    and, ``always`` or where these leave a doubt, as many runs :data:`FAR` times as far out as the members. Points are
-    weighted with the density that they are drawn from, for the posterior and for that of the ensemble, which is
-    Gaussian unless it was ``drawn`` otherwise: where it is the posterior both weights are the same. ``tail_shift`` is
-    the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard deviation of the
-    ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard errors of theirs a
-    distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of
-    a parameter that is surely off by what is warned of, NaN where ``tail_members``, the effective number of the points,
-    is below :data:`TOO_FEW`. ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is
-    the largest ``off`` of :func:`~en4dvar.sampling.ends.examine_ends`, and ``tail_q05_<name>``, ``tail_q95_<name>`` are
-    its points of a parameter where that is what is warned of.
+    and, ``always`` or where members leave a doubt or J rises too little along a parameter, as many runs :data:`FAR`
+    times as far out as the members. Points are weighted with the density that they are drawn from, for the posterior
+    and for that of the ensemble, which is Gaussian unless it was ``drawn`` otherwise: where it is the posterior both
+    weights are the same, whatever the points are.
+    ``tail_shift`` is the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard
+    deviation of the ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard
+    errors of theirs a distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``,
+    ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
+    the effective number of the points, is below :data:`TOO_FEW` to say to what.
+    ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest distance of a 5
+    or 95 % point of that density and of members from those of :func:`~en4dvar.sampling.ends.examine_ends`, in posterior
+    standard deviations, and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what
+    is warned of; there are none where J of all members is what that density says. Nothing of an ensemble without a
+    covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
@@ -137,7 +145,12 @@ def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
 
 
 def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
-    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others."""
+    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
+
+    The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
+    Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
+    ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
+    """
     points, of_points, densities = zip(*parts, strict=True)
     x, costs = np.concatenate(points), np.concatenate(of_points)
     logs = [log_density(x) for log_density in densities]
@@ -169,7 +182,9 @@ def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
 
 
 def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
-    """Mean, std (n,) of points (B, n) of ``shares`` (B,), and by what (B, n) mean and ln std differ without each."""
+    """Mean and standard deviation (n,) of points (B, n) of ``shares`` (B,), and by what (B, n) mean and logarithm of
+    the standard deviation differ without each point, the latter to first order: their jackknife.
+    """
     mean, left = shares @ theta, shares / np.maximum(1 - shares, TINY)
     squares = (theta - mean) ** 2
     std = np.maximum(np.sqrt(shares @ squares), ROUNDING * theta.std(axis=0))
@@ -177,15 +192,15 @@ def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
-    """True if mean or spread of the ensemble are off by half of what is warned of, or an end by what is warned of."""
+    """True if mean or spread of the ensemble are off by half of what is warned of, by the emulator or, by more than
+    their standard error, by weights, or an end of its Gaussian by what is warned of.
+    """
     off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
     return off or shape.get("tail_excess", 0.0) > 1 or shape.get("tail_end", 0.0) > diag.ENDS_OFF
 
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
-    """Of an ensemble (N, n), by the emulator's draws: ``mean_shift``, the largest distance of its mean in posterior
-    standard deviations, and ``spread_ratio``, its standard deviation over theirs where that is farthest from 1.
-    """
+    """How far an ensemble (N, n) is from the emulator's draws."""
     draws = emulator.draws
     std = draws.std(axis=0)
     ratio = ensemble.std(axis=0, ddof=1) / std
@@ -209,11 +224,13 @@ def _emulates(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 
 @dataclass(frozen=True)
 class Refined:
-    """Members (N, n), transformed, that take the ensemble's place, and what judges them. ``modes``: of each minimum,
-    and each group of draws without one, the weight, the quantiles (3, n) of the draws that belong to it, NaN where none
-    does, and the lowest J of these; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, or NaN; ``lowest`` J that was met,
-    at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally likely, none of a chain. ``lower``
-    (n,) lies lower than all minima; then nothing else was sampled.
+    """Members (N, n), transformed, that take the ensemble's place, and what judges them.
+
+    ``modes``: of each minimum, and each group of draws without one, the weight, the quantiles (3, n) of the draws that
+    belong to it, NaN where none does, and the lowest J of these;
+    ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
+    ``lowest`` J that was met, at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally likely;
+    there are none of a chain. ``lower`` (n,) is a draw that lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -236,8 +253,10 @@ def that_count(minima: Sequence[Minimum], prior: Prior, beyond: float = COUNTS) 
 def mode_cautions(
     prior: Prior, minima: Sequence[Minimum], modes: Sequence[Mode], settled: bool, result: Refined | None
 ) -> Iterator[Caution]:
-    """Warnings about the minima that count and the ``modes`` about them; ``result`` is there where sampled, ``settled``
-    tells whether the search for the lowest is. Where not sampled, the first counts however little it holds.
+    """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled.
+
+    ``settled``: whether the search for the lowest of them is. Where not sampled, the first is the one that members
+    describe, which counts however little of the probability it holds: the lowest may be the narrowest.
     """
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
@@ -294,7 +313,9 @@ def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 
 
 def runs_of_doubt(problem: InverseProblem, settings: AssimilationSettings) -> int:
-    """Forward runs that a doubt takes, typically, where it may be settled by sampling."""
+    """Forward runs that a doubt takes, typically, where it may be settled by sampling: draws of the prior and a round
+    of descents from them, an emulator of J, and all rounds of sampling.
+    """
     n = len(problem.prior.names)
     wanted = needed_runs(n) if _emulates(problem, settings) else None
     emulator = 2 * wanted[1] if wanted else 0
@@ -303,8 +324,9 @@ def runs_of_doubt(problem: InverseProblem, settings: AssimilationSettings) -> in
 
 
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
-    """True if the Gaussian about the lowest of the minima that count may not be the posterior. ``agree``: whether
-    descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
+    """True if the Gaussian about the lowest of the minima that count may not be the posterior.
+
+    ``agree``: whether descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
     """
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
     return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear
@@ -319,9 +341,10 @@ def refined(
     looking: bool,
     look: Callable[[ChainRecord], None],
 ) -> Refined:
-    """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n): of a Markov chain
-    where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies lower than all
-    minima.
+    """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
+
+    By a Markov chain where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies
+    lower than all minima. ``look``: see :func:`~en4dvar.sampling.mcmc.sample`.
     """
 
     def cost(x: Array) -> Array:
@@ -371,7 +394,9 @@ def refined(
 
 
 def _own_draws(x: Array, shares: Array, mode: Indices, costs: Array, count: int) -> list[tuple[float, Array, float]]:
-    """What :attr:`Refined.modes` says of ``count`` modes, and those beyond, by draws (D, n) of ``costs`` (D,)."""
+    """Of each of ``count`` modes, and those beyond them, what :attr:`Refined.modes` says, of draws (D, n) of J
+    ``costs`` (D,).
+    """
     own = []
     for number in range(max(count, int(mode.max()) + 1) if count else 0):
         there = mode == number
@@ -391,7 +416,7 @@ def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:
 
 
 def _summary(draws: WeightedDraws, posterior: Array) -> dict[str, float]:
-    """The numbers that judge weighted draws, and how far they are from the ensemble they replace."""
+    """The numbers that judge weighted draws, and how far they are from the ensemble they replace, for the result."""
     std = np.sqrt(np.diag(draws.covariance))
     moved = (draws.mean - posterior.mean(axis=0)) / std
     widened = np.log(std / posterior.std(axis=0, ddof=1))

@@ -1,9 +1,10 @@
 """Every trajectory of one design against every data set: the best fit by NRMSE over a time shift.
 
 This is the "IMR Approach" of Mancia et al. (2021). The design is a scrambled Sobol sequence, uniform in the transformed
-coordinates of the priors within ``width`` standard deviations of their means, in the smallest box around the priors of
-all data sets, which share it; each set takes its fit from within its own. Of each chunk of trajectories only the best
-fit of every set is kept, and an interrupted sweep continues with the chunks that are missing. The fit is
+coordinates of the priors within ``width`` standard deviations of their means. It is shared by all data sets, so a
+trajectory is computed once: where their priors differ it fills the smallest box around all of them, and each set takes
+its fit from within its own. Trajectories stream through in chunks; of each chunk only the best fit of every set is
+kept, on disk where a folder is given, and an interrupted sweep continues with the chunks that are missing. The fit is
 
     NRMSE = 1 − ‖y − ŷ‖ / ‖y − ȳ‖        (section "IMR Approach")
 
@@ -39,9 +40,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Targets:
-    """Readings of S data sets on one time grid. ``grid`` (M,) s; ``values`` and ``nearest`` (sum K,) readings and
-    indices of the grid without shift; readings of set s are ``offsets[s]:offsets[s+1]``; ``scale`` (S,) ‖y − ȳ‖²;
-    ``reach``: the shifts are −reach…reach steps.
+    """Readings of S data sets on one time grid.
+
+    ``grid`` (M,) s; ``values`` and ``nearest`` (sum K,) readings and indices of the grid without shift; readings of
+    set s are ``offsets[s]:offsets[s+1]``; ``scale`` (S,) ‖y − ȳ‖²; ``reach``: the shifts are −reach…reach steps.
     """
 
     grid: Array
@@ -56,8 +58,9 @@ class Targets:
 def targets(
     observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf, most: float = np.inf
 ) -> Targets:
-    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on. Raises ValueError: a
-    reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
+    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
+
+    Raises ValueError: a reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
     """
     reach = int(np.floor(shift / step * (1 + 1e-9)))
     first = min(float(o.times[0]) for o in observations) - reach * step
@@ -125,8 +128,10 @@ def _least_squares(
 @dataclass(frozen=True)
 class SweepSettings:
     """``shift`` and ``step``: the largest time shift and the step of the traces' time grid, in the model's time unit.
+
     After the design come ``rounds`` of local refinement of every set's best fit by differential evolution (Storn &
-    Price 1997, "best/1"): ``local`` trajectories a set, first in ±``width``/4 prior standard deviations about it.
+    Price 1997, "best/1"): ``local`` trajectories a set, first in ±``width``/4 prior standard deviations about it. They
+    follow the narrow valleys of parameters that make up for each other.
     """
 
     trajectories: int
@@ -190,11 +195,16 @@ def run_sweep(
     progress: Progress | None = None,
     earliest: float = 0.0,
 ) -> SweepResult:
-    """Fit every data set: ``problems`` of one model and the same parameters with the same transforms, whose priors may
-    differ. ``folder``: where finished chunks are kept, and found again; the caller clears it. ``earliest``: the instant
-    before which the model has no path; −inf where it has one at any time. Raises ConfigError: the data sets do not
-    share a model, fixed values or parameters; none of these is the model's. DataError: no trajectory fits a set; a
-    reading would be compared before ``earliest``; the step is far too small.
+    """Fit every data set.
+
+    ``problems``: of one model and the same parameters with the same transforms, whose priors may differ. Priors on
+    ``t_s`` and on parameters of the errors play no part: the shift is searched within its limits. ``folder``: where
+    finished chunks are kept, and found again by a sweep that continues; the caller clears it. ``progress``: called
+    with the trajectories done and to do. ``earliest``: the instant before which the model has no path; −inf where
+    it has one at any time.
+
+    Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's.
+    DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step is far too small.
     """
     executor = executor or SerialExecutor()
     mean, std = _moments(problems)
@@ -246,7 +256,10 @@ def _in_common(problem: InverseProblem) -> tuple[object, ...]:
 
 
 def _searched(problem: InverseProblem) -> InverseProblem:
-    """The problem of what a sweep searches, neither the time shift nor errors. Raises :class:`ConfigError`: nothing."""
+    """The problem whose control vector is what a sweep searches: neither the time shift nor parameters of the errors.
+
+    Raises :class:`ConfigError` where that is nothing.
+    """
     apart = {TIME_SHIFT.name, *problem.of_errors}
     terms = tuple(t for t in problem.prior.terms if t.parameter.name not in apart)
     if not terms:

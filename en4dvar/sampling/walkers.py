@@ -16,10 +16,11 @@ MOVES = 5  # of one half of the walkers while the other stands still
 def advance(
     cost: Callable[[Array], Array], x: Array, costs: Array, others: Array, random: Any, moves: int
 ) -> tuple[Array, Array]:
-    """Walkers (W, n) of cost (W,) after so many Metropolis moves on exp(−cost), and their costs. Every move is
-    reversible with respect to exp(−cost) given ``others`` (W', n), and so are they together. ``random`` is numpy's
-    Generator or RandomState. Sources: ter Braak (2006), Stat. Comput. 16, 239; Goodman & Weare (2010), Commun. Appl.
-    Math. Comput. Sci. 5, 65.
+    """Walkers (W, n) of cost (W,) after so many Metropolis moves on exp(−cost), and their costs.
+
+    Every move is reversible with respect to exp(−cost) given ``others`` (W', n), and so are they together.
+    ``random`` is numpy's Generator or RandomState. Sources: ter Braak (2006), Stat.
+    Comput. 16, 239; Goodman & Weare (2010), Commun. Appl. Math. Comput. Sci. 5, 65.
     """
     count, n = x.shape
     x, costs, others = x.T.copy(), costs.copy(), others.T.copy()  # coordinates in rows: long inner loops
@@ -48,8 +49,9 @@ def advance(
 
 
 def walked(cost: Callable[[Array], Array], start: Array, random: Any, rounds: int, left_out: int) -> Array:
-    """Positions (D, n) on exp(−cost) of walkers from ``start`` (W, n), two halves that move in turn. Those of the first
-    ``left_out`` rounds are left out.
+    """Positions (D, n) on exp(−cost) of walkers from ``start`` (W, n), two halves that move in turn.
+
+    Those of the first ``left_out`` rounds are left out.
     """
     halves, kept = list(start.reshape(2, len(start) // 2, -1)), list[Array]()
     of_each = [cost(part) for part in halves]

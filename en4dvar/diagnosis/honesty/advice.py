@@ -1,5 +1,7 @@
-"""What to do about a warning in this very configuration: options as they stand in YAML, values in the user's units;
-each advice leaves out what is done already.
+"""What to do about a warning in this very configuration: options as they stand in YAML, values in the user's units.
+
+The catalogue says what can be done in general. Here each advice leaves out what is done already, so that following it
+does not bring the same words back.
 """
 
 import math
@@ -299,7 +301,9 @@ def _gaussian(case: Case) -> str:
 
 
 def _lost(case: Case) -> str:
-    """A cut of the prior is advised where it takes no values that the model allows."""
+    """A cut of the prior is advised where it takes no values that the model allows: where the model fails along a
+    curve, no parameter alone has such an edge.
+    """
     a, lost = case.a, ~active_members(case.a.prior_failures)
     edges = [(a.parameters[s.j], s) for s in sides_of_lost(a.prior, lost) if s.others <= FEW * lost.sum()]
     ways = ["find out why it fails"]

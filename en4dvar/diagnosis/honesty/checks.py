@@ -76,8 +76,10 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
 
 
 def structure(analysis: Analysis) -> Findings:
-    """Residuals that are not the independent numbers of one variance that they should be. Each probability is that of a
-    finding at least as odd where model, prior and errors are right.
+    """Residuals that are not the independent numbers of one variance that they should be.
+
+    Each probability is that of a finding at least as odd where model, prior and errors are right; :data:`ODD` keeps all
+    together below half a per cent.
     """
     residuals = analysis.residuals
     if residuals is None or not residuals.enough:
@@ -157,8 +159,10 @@ def conflict(prior: Prior, centre: Array, timed: bool = False) -> Findings:
 
 def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array, timed: bool = False) -> Findings:
     """A minimum of J where 2 J_b is beyond what χ²_n exceeds once in 4000, or one of the z² beyond what the largest of
-    n does. ``z`` (n,) are prior standard deviations from the mean of each of ``terms``, by what it is called; ``white``
-    (n,) are its white coordinates.
+    n does.
+
+    ``z`` (n,) are prior standard deviations from the mean of each of ``terms``, by what it is called; ``white`` (n,)
+    are its white coordinates.
     """
     each = diag.TAIL / 2
     together, alone = diag.chi2_interval(len(z), each)[1], diag.chi2_interval(1, each / len(z))[1]
@@ -203,9 +207,10 @@ def shown(value: float, p: Parameter) -> str:
 
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
-    """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std),
-    with those that failed for leaving it. The prior's own share near the bound is no finding, three times it is. A
-    lognormal has no bound.
+    """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std).
+
+    Members that failed because the parameter left its bounds count as piled up. A lognormal has no bound to pile up
+    at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
@@ -227,9 +232,10 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
 
 
 def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, times: Array, leverage: Array) -> Findings:
-    """Posterior members (N, V) whose path leaves what the model's equations assume, ``since`` (N, V) when. Serious
-    where readings that lie beyond inform: ``leverage`` (K,) at ``times`` (K,) is the share of each in its own
-    prediction, and sums to the DFS of the data.
+    """Posterior members (N, V) whose path leaves what the model's equations assume, ``since`` (N, V) when.
+
+    Serious where readings that lie beyond inform: ``leverage`` (K,) at ``times`` (K,) is the share of each in its own
+    prediction, and sums to the DFS of the data. A system at rest, say, tells nothing.
     """
     for v, limit in enumerate(limits if extremes.size else ()):
         reached = extremes[:, v]
@@ -255,8 +261,10 @@ def information(
     prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = (), modes: Mapping[str, str] = NONE
 ) -> Findings:
     """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
-    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names. ``modes`` says of
-    which field a name is a mode: those of a field are counted in one finding.
+
+    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
+    may not be the posterior, or come from modes apart, or they need not be informed. ``modes`` says of which field a
+    name is a mode: those of a field are counted in one finding.
     """
     of_fields: dict[str, list[str]] = {}
     moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
@@ -274,9 +282,12 @@ def information(
 
 
 def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approximate: str = "") -> Findings:
-    """Members (N, n), physical and alive, whose mean, spread or ends are not the posterior's, in what is printed.
-    ``shape`` holds mean and std of the posterior by an emulator or by weights, and 5 and 95 % points. ``approximate``:
-    what a scheme does that is no posterior even where this is Gaussian.
+    """Members (N, n), physical and alive, whose mean, spread or ends are not the posterior's.
+
+    Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
+    posterior by an emulator or by weights, and 5 and 95 % points. The finding is about the parameters that are off, and
+    serious where one is off by much. ``approximate``: what a scheme does that is no posterior even where this is
+    Gaussian.
     """
     if not shape.get("non_gaussian", diag.is_non_gaussian(shape)):
         return
@@ -358,9 +369,11 @@ def loss(
     stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None, events: bool = False,
     sampled: bool = False,
 ) -> Findings:  # fmt: skip
-    """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive. ``members`` (N, n),
-    transformed, are where they were run. ``events``: a member that gives no reading is improbable by the data instead
-    of lost. ``sampled``: by a likelihood that is zero where the model fails, the posterior was sampled after this.
+    """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
+
+    ``members`` (N, n), transformed, are where they were run, if that tells anything. ``events``: a member that gives no
+    reading lacks what was seen, and is improbable by the data instead of lost. ``sampled``: the posterior was sampled
+    after this forecast, by a likelihood that is zero where the model fails.
     """
     absent = np.array([events and reason == NOT_FINITE for reason in failures], dtype=bool)
     lost = ~diag.active_members(failures) & ~absent
@@ -391,9 +404,10 @@ class Side(NamedTuple):
 
 
 def sides_of_lost(members: Array, lost: Mask) -> list[Side]:
-    """The parameters that tell lost ``members`` (N, n) from the others, the clearest first: the rank sum of the lost
-    ones (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) would by chance be as far off in less than :data:`BY_CHANCE` of
-    all cases.
+    """The parameters that tell lost ``members`` (N, n), physical or transformed, from the others, the clearest first.
+
+    These are those of which the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) would be as
+    far from its expectation by chance in less than :data:`BY_CHANCE` of all cases, in any of the parameters.
     """
     n_lost, n_alive = int(lost.sum()), int((~lost).sum())
     from scipy.stats import mannwhitneyu  # where members are lost: its import takes long
@@ -414,7 +428,9 @@ def sides_of_lost(members: Array, lost: Mask) -> list[Side]:
 
 
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
-    """Where the lost members lie, in words and display units: the parameters that tell them from the others."""
+    """Where the lost members lie, in words and display units: the parameters that tell them from the others. Of one or
+    two members that no parameter tells from the others each is described.
+    """
     sides = sides_of_lost(members, lost)
     if not sides:
         return _one_by_one(prior, members[lost]) if lost.sum() < 3 else "they are spread over the whole ensemble"

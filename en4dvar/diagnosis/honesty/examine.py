@@ -26,8 +26,10 @@ NO_SPREAD = 1e-14  # of the size of values: members that agree to rounding
 
 @dataclass(frozen=True)
 class ControlEnsembles:
-    """The ensembles (N, n) and the centre (n,) of an analysis in transformed space, without fields, and J of the
-    posterior: ``costs`` (N,) are +inf where a member failed, and None of a localised scheme.
+    """The ensembles of an analysis as control vectors, that is in transformed space, and J of the posterior.
+
+    N members, n parameters. ``costs`` (N,) are +inf where a member failed, and None of a localised scheme, whose J is
+    not that of these members; whole fields are no part of it.
     """
 
     prior: Array
@@ -41,7 +43,9 @@ def examine(
     analysis: Analysis, control: ControlEnsembles, worst_loss: Sequence[str] = (), earlier: tuple[Caution, ...] = ()
 ) -> tuple[Caution, ...]:
     """Everything that should keep a reader from trusting the posterior, or that they should know, worst first.
-    ``worst_loss`` (N,) are the failures in the iteration that lost most; ``earlier`` are warnings met on the way.
+
+    ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``earlier``
+    are warnings met on the way.
     """
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
@@ -126,6 +130,9 @@ def _validity(a: Analysis, alive: Mask) -> checks.Findings:
 def unfinished(analysis: Analysis) -> checks.Findings:
     """Iterations that stopped before their own criterion; a note where the next step would have been short, or members
     were drawn from the posterior itself afterwards, and nothing where no user would see it.
+
+    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the
+    ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
     if analysis.converged or step_norm <= UNSEEN:
@@ -145,8 +152,10 @@ def unfinished(analysis: Analysis) -> checks.Findings:
 
 
 def collapse(prior: Prior, control: ControlEnsembles, alive: Mask) -> checks.Findings:
-    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n. The
-    lowest J met, of a member or of the centre, stands for the minimum.
+    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n; of
+    draws of another one it may be less.
+
+    The lowest J met, of a member or of the centre, stands for the minimum.
     """
     assert control.costs is not None
     costs = control.costs

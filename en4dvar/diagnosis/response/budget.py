@@ -24,7 +24,9 @@ TOLD = 0.03  # share from which a source is named
 
 
 def shares_of_priors(covariance: Array, prior_variance: Array) -> Array:
-    """(n, n): share of the variance of i by the prior of j, from ``covariance`` and prior variance, transformed."""
+    """(n, n): the share of parameter i's variance that comes from the prior of parameter j. ``covariance`` (n, n) of
+    the posterior and ``prior_variance`` (n,), transformed; parameters independent before.
+    """
     return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
 
 
@@ -56,7 +58,9 @@ def budget(a: Analysis, name: str) -> Mapping[str, float]:
 
 
 def largest(shares: Mapping[str, float], members: int) -> list[str]:
-    """The largest share, and those within two standard errors of it: of a squared correlation 2 |ρ| (1 − ρ²) / √N."""
+    """The largest share, and those that ``members`` do not tell from it. A share is a squared correlation ρ², of
+    standard error 2 |ρ| (1 − ρ²) / √N; two errors of a difference are doubt.
+    """
     spread = {source: 2 * share**0.5 * (1 - share) / members**0.5 for source, share in shares.items()}
     first = next(iter(shares))
     return [s for s in shares if shares[first] - shares[s] <= 2 * np.hypot(spread[first], spread[s])]

@@ -10,7 +10,8 @@ whose integral is the parameter's degrees of freedom for signal but for what act
 of |a_j| that falls into a cell of time is the weight of what the path went through there.
 
 L comes from runs that resume the path at the edges of the cells with the parameter changed from there on; neighbours
-differ by what the change does within one cell.
+differ by what the change does within one cell. The reading of an instant is thus credited to all of its past, as it
+should: a rebound tells of the viscosity in the collapse before it.
 """
 
 from dataclasses import dataclass
@@ -35,9 +36,10 @@ QUANTILES = (0.05, 0.5, 0.95)
 
 @dataclass(frozen=True)
 class Ledger:
-    """P parameters, M cells of time, V quantities of the path, at the centre of the posterior. ``edges`` (M + 1,) of
-    the cells in the model's time; ``values`` (V, M), the mean size of each quantity in a cell; ``kernel`` (P, M), a_j
-    integrated over each cell; ``runs`` (parts of) forward runs it took. NaN where a run failed.
+    """P parameters, M cells of time, V quantities of the path, at the centre of the posterior.
+
+    ``edges`` (M + 1,) of the cells in the model's time; ``values`` (V, M), the mean size of each quantity in a cell;
+    ``kernel`` (P, M), a_j integrated over each cell; ``runs`` (parts of) forward runs it took. NaN where a run failed.
     """
 
     parameters: tuple[str, ...]
@@ -69,8 +71,10 @@ def weighted_quantiles(values: Array, weights: Array) -> Array:
 
 
 def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Ledger | None:
-    """The ledger of a posterior with standard deviations ``std`` (n,), transformed, in this process; None where the
-    model names no quantities of its path, none of its path parameters is estimated, or it cannot be run like this.
+    """The ledger of a posterior with standard deviations ``std`` (n,), transformed, in this process.
+
+    None where the model names no quantities of its path, none of its path parameters is estimated, or it cannot be run
+    like this: a model may fail in any way, and the posterior is there already.
     """
     names = tuple(name for name in problem.prior.names if name in problem.model.path_parameters)
     if not names or not problem.model.path_quantities or not response.defined or not np.all(std > 0):
@@ -133,7 +137,9 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
 def _localised(
     problem: InverseProblem, states: Array, start: Array, shift: float, changes: list[tuple[int, float]]
 ) -> Array:
-    """Change of predictions (P, M, K) by each change (column, value) in each cell, from ``states`` at ``start``."""
+    """The change of predictions (P, M, K) by each change (column of the state, value) within each cell. ``states`` (M,
+    n_state) of the path at ``start`` (M,) of each cell; readings are ``shift`` later than they say.
+    """
     n_cells, variants = len(states), [states]
     for column, value in changes:
         changed = states.copy()

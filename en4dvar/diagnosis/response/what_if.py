@@ -8,9 +8,10 @@ tangent S (K', r) at the mode x̂ of J,
 g' the gradient of the changed problem and g that of the problem itself (0 at its minimum, within what the iterations
 leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy − δm), C = EᵀA⁻¹E the covariance of the posterior.
 
-A wrong assumption is an alternative that the model offers. Its first run, at the mode, gives the linear response; each
-further one, where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in
-every parameter. An alternative that does not settle within :data:`MOST_RUNS` is fitted again.
+A wrong assumption is an alternative that the model offers. Its first run, at the mode, gives the linear response.
+Unless that is small anyway each further one, where it leads, corrects it with the same tangent (a chord iteration),
+until what it changes is small in every parameter. An alternative that does not settle within :data:`MOST_RUNS` is
+beyond linear response and is fitted again.
 """
 
 import math
@@ -41,8 +42,10 @@ SMALL = 0.3  # posterior standard deviations of a first step that is believed wi
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """The tangent of the predictions at a control vector ``at`` (n,): ``linear`` holds anomalies (r, K) per unit of r
-    coordinates, ``directions`` E (r, n) the control vector's change per unit of each, ``precision`` is N − 1.
+    """The tangent of the predictions at a control vector ``at`` (n,), and the prior about it.
+
+    ``linear`` holds anomalies (r, K) per unit of r coordinates, ``directions`` E (r, n) the control vector's change per
+    unit of each, ``precision`` is N − 1.
     """
 
     at: Array
@@ -75,7 +78,9 @@ class LinearResponse:
         self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
     ) -> tuple[Array, float]:
         """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
-        and a tangent, and by how much its J falls on the way; ``prior_shift`` (n,) is the change of the prior's mean.
+        and a tangent, and by how much its J falls on the way, as far as it is quadratic.
+
+        ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
         """
         d, S = self.whitened
         changed, tangent = observations.whiten(linear)
@@ -108,10 +113,12 @@ Fitted = Callable[[InverseProblem], Fit | None]
 
 @dataclass(frozen=True)
 class Shift:
-    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …". ``change`` (n,) of the
-    mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be negative (else NaN),
-    ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there minus J of the fit.
-    Where linear response does not tell, these are NaN and ``reason`` says why.
+    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …".
+
+    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
+    negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
+    minus J of the fit, positive where the data speak against the alternative. Where linear response does not tell,
+    these are NaN and ``reason`` says why. ``runs``: forward runs it took.
     """
 
     name: str
@@ -155,8 +162,10 @@ def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str
 def what_if(
     problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor, fitted: Fitted
 ) -> tuple[Shift, ...]:
-    """The shifts of all alternatives of the model: the largest first, then those unknown. ``std`` (n,) of the
-    posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None where that fails.
+    """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
+
+    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None
+    where that fails. A scale that is estimated has an uncertainty of its own.
     """
     if not response.defined or not np.all(std > 0):
         return ()
@@ -166,10 +175,12 @@ def what_if(
 
 
 def with_shifts(members: Array, shifts: Sequence[Shift], seed: int) -> Array:
-    """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well. A member is
-    moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)), s_k (n,) the settled shifts, with ξ of zero mean and unit covariance over
-    the members that is uncorrelated with them (where N exceeds n and the number of shifts together), so that C + Σ_k
-    s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
+    """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well.
+
+    Every settled shift s_k (n,) counts as one standard deviation along its direction, as far as the data allow it:
+    a member is moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)) with ξ of zero mean and unit covariance over the members that
+    is uncorrelated with them (where N exceeds n and the number of shifts together), so that
+    C + Σ_k s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
     """
     moved = in_std_as_likely(shifts) * members.std(axis=0, ddof=1)
     z = member_stream(seed, "what if").standard_normal((len(members), len(moved)))
@@ -255,7 +266,9 @@ def _shift(
 
 @dataclass(frozen=True)
 class _Chord:
-    """Where a chord iteration led, its last run at ``known``, J of the readings at the end; ``failure`` at the mode."""
+    """Where a chord iteration led: ``moved`` (n,), its last run at ``known`` (n,), the readings' part of J at the end,
+    as far as it is quadratic; ``failure`` of the run at the mode.
+    """
 
     settled: bool
     moved: Array
