@@ -1,7 +1,6 @@
 """Instants of planned readings; the ``design:`` section: which experiments are compared, about what, how accurately."""
 
-from collections.abc import Iterator, Mapping
-from itertools import product
+from collections.abc import Mapping
 from math import prod
 from typing import Annotated, Any, Literal
 
@@ -156,11 +155,6 @@ class Design(Section, SampleSizes):
         sizes = [len(k["values"]) for k in knobs.values() if isinstance(k, dict) and isinstance(k.get("values"), list)]
         if prod(sizes) > MOST:
             faults.add(("knobs",), f"{prod(sizes)} combinations; at most {MOST}", at_key=True)
-
-    def settings(self) -> Iterator[dict[str, Value]]:
-        """Name of the knob → value, of every combination."""
-        for values in product(*(knob.values for knob in self.knobs.values())):
-            yield dict(zip(self.knobs, values, strict=True))
 
 
 def _check_laws(laws: Mapping[str, Any], faults: Faults) -> None:

@@ -124,7 +124,7 @@ def within_time_limit(batch: Callable[[], T]) -> T:
     if seconds is None:
         return batch()
     by_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    _watch(_end_of(seconds))
+    _watch(seconds)
     try:
         return within(seconds, batch, _Signal() if by_signal else None)
     except TimeLimitError:
@@ -156,7 +156,7 @@ class _Signal:
     def _continue(self, *_: Any) -> None:
         if self.armed:
             self.certain = False
-            _watch(_end_of(self.seconds))
+            _watch(self.seconds)
             signal.setitimer(signal.ITIMER_REAL, self.seconds)
 
     def stop(self) -> None:
@@ -164,17 +164,12 @@ class _Signal:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _end_of(seconds: float) -> float:
-    """When a process is ended whose batch begins now and has so many seconds."""
-    return time.monotonic() + 2 * seconds + 1
-
-
-def _watch(deadline: float | None) -> None:
-    """End this process at ``deadline`` of this thread, if it comes to that; None: it did not."""
+def _watch(seconds: float | None) -> None:
+    """End this process if a batch of this thread that begins now, and has so many seconds, does not; None: it ended."""
     with _arming:
         _deadlines.pop(threading.get_ident(), None)
-        if deadline is not None:
-            _deadlines[threading.get_ident()] = deadline
+        if seconds is not None:
+            _deadlines[threading.get_ident()] = time.monotonic() + 2 * seconds + 1
         faulthandler.cancel_dump_traceback_later()
         if _deadlines:
             left = max(min(_deadlines.values()) - time.monotonic(), 0.01)

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pydantic import create_model
+
 from en4dvar.assembly.build import build_one, build_sequence, data_files, inverse_plan
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
@@ -77,17 +79,12 @@ def require_counted_once(config: Config, files: Mapping[str, DataFile]) -> None:
 def _faults_of_data(document: Document, base: Path) -> list[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     context = context_of(document, base, None)
-    section = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
+    alone: Any = create_model("DataAlone", __base__=Section, data=(DATA, ...))
+    section: Any = check(alone, {"data": document.data.get("data")}, (), document, [], context)
     if section is None or context.default is None:
         return []
     plan = section.data
     return _read_files(document, plan, lambda name, file: read_observations(plan, file, name))[1]
-
-
-class _DataSection(Section):
-    """The section of the data alone."""
-
-    data: DATA
 
 
 def _read_files(document: Document, plan: DataPlan, read: Callable[[str, DataFile], T]) -> tuple[list[T], list[Fault]]:

@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -285,7 +286,8 @@ def candidates(document: Document, base: Path) -> Iterator[Candidate]:
     design = first.config.design
     if design.knobs:
         places = {knob.key: str(document.fault(("design", "knobs", name), "")) for name, knob in design.knobs.items()}
-        for settings in design.settings():
+        for values in product(*(knob.values for knob in design.knobs.values())):
+            settings = dict(zip(design.knobs, values, strict=True))
             overrides = {design.knobs[name].key: value for name, value in settings.items()}
             yield Candidate.of(settings, override(document, overrides, places=places), base)
 

@@ -14,7 +14,6 @@ those of one ensemble; its reason is kept.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -183,7 +182,7 @@ class _Run:
                 return [members]
             if self.error.form == "square-root":
                 return [members, self.error.widened(members, self.flow.elapsed(newest))]
-            return [self.flow.changed(members, self.noise(members, newest), newest)]
+            return [self.error.added(members, self.noise(members, newest), self.flow.elapsed(newest))]
         for index in range(first, newest + 1) if self.error else ():
             members = np.hstack([members, self.noise(members, index)])
         return [members]
@@ -305,9 +304,10 @@ class _Run:
 
         def descend(rows: Rows) -> tuple[CycleWindow, CycleDescent]:
             alive = members[rows]
+            # the numbers of a member are the same however many follow it
             window = CycleWindow(
-                self.flow, self.series, alive, self.start, batch, self.settings.localisation,
-                self.scheme, partial(self.stream, len(alive)),
+                self.flow, self.series, alive, self.start, batch, self.settings.localisation, self.scheme,
+                lambda name, size: member_stream(self.seed, name).standard_normal((len(alive), size)),
             )  # fmt: skip
             descent = CycleDescent(Weights.prior(len(alive)))
             minimise(window, [descent])
@@ -315,10 +315,6 @@ class _Run:
 
         rows, (window, descent) = self.surviving(descend)
         return rows, window, descent
-
-    def stream(self, n_members: int, name: str, size: int) -> Array:
-        """Standard normal numbers (N, size), of each member the same however many follow it."""
-        return member_stream(self.seed, name).standard_normal((n_members, size))
 
     def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
         """Which rows survive, and the states (N', n) at the times of ``indices``."""

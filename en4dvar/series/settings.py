@@ -104,7 +104,8 @@ class Inflation:
         multiplicative   X ← λ X                                                    Anderson & Anderson (1999)
         RTPS             X_j ← X_j (1 + α (σ_b,j − σ_a,j) / σ_a,j)                   Whitaker & Hamill (2012)
 
-    λ ``multiplicative`` and α ``rtps`` (relaxation to prior spread, 0: none, 1: the spread of the prior).
+    λ ``multiplicative`` and α ``rtps`` (relaxation to prior spread, 0: none, 1: the spread of the prior; Mon. Wea. Rev.
+    140, 3078, eq. 2), which leaves alone what has no spread.
 
     Raises ValueError: a factor that is not positive, or α outside [0, 1].
     """
@@ -122,17 +123,9 @@ class Inflation:
         """Analysis anomalies (N, n) inflated; ``prior`` (N, n) is the ensemble before the analysis."""
         if self.rtps:
             spread = np.sqrt(np.sum(anomalies**2, axis=0) / (len(anomalies) - 1))
-            anomalies = anomalies * relaxation(prior.std(axis=0, ddof=1), spread, self.rtps)
+            lost = prior.std(axis=0, ddof=1) - spread
+            anomalies = anomalies * (1 + self.rtps * np.divide(lost, spread, out=np.zeros_like(lost), where=spread > 0))
         return anomalies if self.multiplicative == 1 else self.multiplicative * anomalies
-
-
-def relaxation(prior_std: Array, posterior_std: Array, alpha: float) -> Array:
-    """Factors (n,) of relaxation to prior spread; 1 where the posterior has no spread.
-
-    Source: Whitaker & Hamill (2012), Mon. Wea. Rev. 140, 3078, eq. 2.
-    """
-    lost = prior_std - posterior_std
-    return 1 + alpha * np.divide(lost, posterior_std, out=np.zeros_like(lost), where=posterior_std > 0)
 
 
 NO_INFLATION = Inflation()

@@ -100,12 +100,14 @@ class Flow:
         if not ahead:
             return [states] * len(indices)
         self.runs += len(members)
-        if members.shape[1] == self.size:
+        if self.error is None or members.shape[1] == self.size:
             paths = self.move(states, start, ahead)
             return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))]
-        reached = {start: states}
+        reached, q = {start: states}, len(self.error.where)
         for i in range(start + 1, max(ahead) + 1):
-            reached[i] = self.changed(self.move(reached[i - 1], i - 1, [i])[:, 0], self.noise_of(members, start, i), i)
+            first = self.size + (i - start - 1) * q
+            moved, noise = self.move(reached[i - 1], i - 1, [i])[:, 0], members[:, first : first + q]
+            reached[i] = self.error.added(moved, noise, self.elapsed(i))
         return [reached[i] for i in indices]
 
     def move(self, states: Array, start: int, indices: Sequence[int]) -> Array:
@@ -117,18 +119,6 @@ class Flow:
         paths = propagate(self.model, physical, self.times[start], times, self.executor)
         moved = self.coordinates.from_physical(paths, states)
         return require_finite(moved) if self.coordinates.logarithms else moved
-
-    def noise_of(self, members: Array, start: int, index: int) -> Array:
-        """The changes (N, q) at the time of ``index``."""
-        assert self.error is not None
-        q = len(self.error.where)
-        first = self.size + (index - start - 1) * q
-        return members[:, first : first + q]
-
-    def changed(self, states: Array, noise: Array, index: int) -> Array:
-        """States (N, n) at the time of ``index`` with what the model has missed since the time before."""
-        assert self.error is not None
-        return self.error.added(states, noise, self.elapsed(index))
 
     def elapsed(self, index: int) -> float:
         """Time between an observation and the one before it."""

@@ -13,7 +13,7 @@ from en4dvar.schemes.filters import ETKF, EnKF
 from en4dvar.schemes.localisation import BlockLocalisation, distances, gaspari_cohn
 from en4dvar.series.moments import BLOCK, MomentsRecorder
 from en4dvar.series.sequential import Rotations, reflections, rotate
-from en4dvar.series.settings import Inflation, relaxation
+from en4dvar.series.settings import Inflation
 
 RNG = np.random.default_rng
 
@@ -33,7 +33,8 @@ def test_relaxation_moves_the_spread_between_posterior_and_prior(alpha):
     expected = (1 - alpha) * after + alpha * before
     assert relaxed.std(axis=0, ddof=1)[:3] == pytest.approx(expected[:3], rel=1e-13)
     assert np.array_equal(relaxed[:, 3], np.zeros(6))  # a variable without spread is given none
-    assert relaxation(before, before, alpha) == pytest.approx(np.ones(4))
+    anomalies = centre(prior)[1]
+    assert Inflation(rtps=alpha).apply(prior, anomalies) == pytest.approx(anomalies)
 
 
 @pytest.mark.parametrize("arguments", [(0.0,), (-1.0,), (1.0, -0.1), (1.0, 1.1)])
