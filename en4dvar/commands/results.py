@@ -145,8 +145,10 @@ def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, tru
 def _populations(
     run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], known: Known, alone: bool
 ) -> PopulationsCompared | None:
-    """The populations of the runs side by side, told on standard output; None where there are none to compare. Raises
-    :class:`OutputError`: they cannot be, and the folders hold nothing else (``alone``), or options ask for it.
+    """The populations of the runs side by side, told on standard output; None where there are none to compare.
+
+    ``alone``: the folders hold nothing else. Raises :class:`OutputError`: they cannot be compared, and nothing else
+    can be, or options ask for it.
     """
     from en4dvar.report.populations import compare_populations, medians_table, sentences
     from en4dvar.results.together import POPULATION

@@ -75,7 +75,10 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
 
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
-    """Tables on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
+    """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has.
+
+    Of a campaign: the table of its data sets, of many that of its parameters, and its warnings counted by kind.
+    """
     from en4dvar.estimation.summary import Estimates, results_table
 
     few, warnings, spread = len(campaign) <= MOST_TOLD, _Warnings(), Estimates()
@@ -149,7 +152,10 @@ class _Warnings:
             self.of[caution.code] = sorted(told, key=lambda entry: entry[0])[:MOST_TOLD]
 
     def lines(self) -> Iterator[str]:
-        """One for each kind, the worst first; what only leads to a joint estimate is one line, unless it is serious."""
+        """One for each kind, the worst first; of a single data set one for each warning.
+
+        Where a joint estimate follows, what is less than serious in its single data sets is one line.
+        """
         begun = []
         for told in sorted(self.of.values(), key=lambda entries: entries[0][2].rank):
             _, name, worst = told[0]

@@ -54,7 +54,8 @@ def check(
 
 @dataclass(frozen=True)
 class _Finding:
-    """A fault; ``absent``: of a key that the file may lack, ``kind``: the value is of no kind that can stand there."""
+    """A fault at ``place``; ``absent``: its last key may be one that the file lacks; ``kind``: the value is of no
+    kind that can stand there, of which there may be several."""
 
     place: Place
     message: str

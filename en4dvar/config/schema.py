@@ -261,7 +261,9 @@ class OfScheme(Section):
 
     @classmethod
     def _require_free(cls, kind: type[Scheme], section: Any) -> None:
-        """Raise :class:`ConfigError` for a key whose name is taken, or one without a default that is not given."""
+        """Raise :class:`ConfigError` where a key of the scheme has a name that means something else in the section,
+        or has no default and is not given.
+        """
         own = cls.model_fields.keys() - frozenset().union(*map(keys_of, cls.kinds.values()))
         names = [key.name for key in fields(kind)]
         if taken := [name for name in names if name in own or hasattr(cls, name) or name.startswith("_")]:

@@ -123,7 +123,10 @@ class DaskExecutor(FuturesExecutor):
             future.release()
 
     def _value(self, future: "Future[Any]") -> Any:
-        """What the call gave or raised, perhaps computed again. Raises :class:`ExecutorError`: the cluster is gone."""
+        """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
+
+        Raises :class:`ExecutorError` where the cluster is gone.
+        """
         from distributed import CancelledError, KilledWorker
 
         self._listening.pop(str(future.key), None)
@@ -179,7 +182,10 @@ class DaskExecutor(FuturesExecutor):
 
 
 def _takes_work(worker: Mapping[str, Any]) -> bool:
-    """Whether a worker will begin a call, or is at one: Dask pauses those near their memory limit, which begin none."""
+    """Whether a worker, as its scheduler describes it, will begin a call, or is at one.
+
+    Dask pauses a worker near its memory limit: it ends the calls that it is at, and begins none.
+    """
     return worker.get("status") != "paused" or worker["metrics"]["task_counts"].get("executing", 0) > 0
 
 

@@ -49,7 +49,10 @@ class _Worker:
             self.pipe.send_bytes(message)
 
     def answer(self, tell: Tell | None = None) -> Any:
-        """The value of the call that ends, or what it raised; None as the worker starts. Raises :class:`_DeadError`."""
+        """Wait for the call to end; its value or what it raised. None as the worker starts.
+
+        Raises :class:`_DeadError`.
+        """
         while True:
             content = memoryview(self.receive())
             try:

@@ -95,7 +95,9 @@ def _temporary_folder() -> Path:
 
 
 def _own_folder(temporary: Path) -> Path:
-    """A folder of the user's processes that nobody else can write, for numba runs what it finds there."""
+    """A folder that nobody else can write: numba runs what it finds there. It has the same name for every process of
+    the user; where somebody else holds that name, a new one is made.
+    """
     user = os.getuid() if hasattr(os, "getuid") else None
     folder = temporary / f"en4dvar-numba-{'user' if user is None else user}"
     with suppress(FileExistsError):
@@ -196,7 +198,9 @@ KERNELS: list[Any] = []
 
 
 def _kernels(**options: Any) -> Callable[[F], F]:
-    """Functions compiled by numba with these options, without the interpreter's lock; errors as of :func:`keep`."""
+    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock. Raises
+    :class:`OutputError`: nowhere can compiled code be kept.
+    """
 
     def compiled(function: F) -> F:
         if getattr(numba.config, "DISABLE_JIT", 0):

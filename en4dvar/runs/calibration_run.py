@@ -161,7 +161,9 @@ def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]
 def _compared(
     problem: InverseProblem, config: Config, seed: int, truth: Mapping[str, float], number: int, name: str
 ) -> Judged:
-    """Ranks, quantiles and z of every parameter and of J_o; NaN where the truth lacks one or lies beyond the prior."""
+    """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings; NaN of J_o where
+    the truth lacks a parameter or lies beyond the prior.
+    """
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
     members = prior.from_physical(analysis.posterior)

@@ -67,7 +67,11 @@ def run_sequence(
 
 @dataclass(frozen=True)
 class Cycles(RunKind[R]):
-    """A run of cycles; ``on_cycle`` as of :func:`run_twin` and :func:`run_sequence`, ``summary``: result → CSV."""
+    """A run of cycles; its files are called after the kind.
+
+    ``on_cycle`` is called with the number of each cycle, or the index of its last observation time, from 0.
+    ``summary``: result → ``summary.csv``.
+    """
 
     units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)

@@ -87,6 +87,7 @@ def run_design(
 
     ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next? Of a
     population what it says of its next data set.
+    ``on_design`` is called with how many designs are done, and of how many.
 
     Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
     :class:`OutputError`: the directory cannot.
@@ -156,7 +157,9 @@ class DesignKind(RunKind[Designs]):
         return load_designs(file)
 
     def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
-        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
+        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off. A nested
+        estimate of few effective draws is no check: the linearised one stands and says so.
+        """
         every, method = range(len(self.every)), self.config.design.method
         if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
             self._evaluate(kept, executor, every, "laplace" if method == "auto" else method)

@@ -61,8 +61,12 @@ class Kind:
 
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
-        """Write the page of the run in ``folder`` from its result files, with arguments and errors as of
-        :func:`write_report`; None for a kind that has none.
+        """Write the page of a finished run from its result files; None for a kind that has none.
+
+        ``folder``: of the run. ``datasets``: those that get a page of their own in any case. ``workers``: processes
+        that draw. ``figures``: also keep the figures as PDF and PNG.
+
+        Raises :class:`OutputError`.
         """
         if not cls.writer:
             return None
@@ -274,8 +278,13 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
 
 @contextmanager
 def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Iterator[Session]:
-    """Hold the log of a run, put the result in place where the block ends well, and tell what is kept where it does
-    not. Raises :class:`OutputError`: the log or the result cannot be written; :class:`Interrupted`.
+    """Hold the log of a run in its ``directory``, and put the result in place where the block ends well.
+
+    ``command``: what the user typed. What the user has of a run that is stopped becomes part of the last words of an
+    interrupt and of errors that a resumed run survives.
+
+    Raises :class:`OutputError`: the log cannot be written, the result not put in place. :class:`Interrupted`: the block
+    was.
     """
 
     def kept() -> str:

@@ -172,7 +172,9 @@ class EstimateKind(RunKind[Campaign]):
 
 
 def _estimate(work: Worklist, executor: Executor) -> None:
-    """Every data set, and the campaign's file. Raises as :meth:`Worklist.work`; :class:`DamagedError`: twice of one."""
+    """Every data set, and the campaign's file; a result that was damaged since it was written is estimated again, once.
+    Raises what :meth:`Worklist.work` does; :class:`DamagedError` where that was of no use, as on a disk that fails.
+    """
     repeated: set[str] = set()
     while True:
         work.work(executor)

@@ -342,7 +342,9 @@ class Worklist:
         return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:
-        """Where its iterations are kept."""
+        """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
+        removed, never written in place. To look at each for a link is a tenth of what a data set costs this process.
+        """
         # the folder was looked at as the run began; to look at each file for a link takes a tenth of the work here
         return self.run.directory.work / d.iteration
 

@@ -251,7 +251,9 @@ class _Run:
         self.start = next_start
 
     def interpolated(self, window: CycleWindow, newest: int) -> tuple[Array, Array]:
-        """Mean and anomalies (N, n) after an analysis with averaged covariances, in which later times weigh more."""
+        """Mean and anomalies (N, n) after an analysis with averaged covariances, in which a time weighs by its number:
+        what the members were before they had forgotten their start fades.
+        """
         (ahead,) = window.ahead
         reference, predicted = centre(ahead.predicted)
         now = (each.T @ predicted / (len(predicted) - 1) for each in (window.anomalies, predicted))
@@ -280,7 +282,10 @@ class _Run:
             self.predicted.put(at.index - 1, predicted)
 
     def check_repeats(self) -> None:
-        """Raise :class:`ConfigError` where two members, over the first interval, differ when they are run again."""
+        """Two members, over the first interval, twice: in one order and in the other; no cycle uses these runs.
+
+        Raises :class:`ConfigError`: they differ.
+        """
         flow, start = self.flow, self.start
         end = next((i for i in range(start + 1, len(flow.times)) if flow.times[i] > flow.times[start]), None)
         if end is None:

@@ -240,7 +240,10 @@ class CycleWindow(Objective[CycleDescent]):
 
 
 def _over(localisation: BlockLocalisation, flow: Flow, size: int, times: int) -> BlockLocalisation:
-    """The same for observations at several ``times`` and members with model errors, localised as their variables."""
+    """The same for members that hold model errors too, and for observations at several ``times``.
+
+    The changes of a variable are localised as the variable is.
+    """
     blocks = localisation.blocks
     if flow.error is not None and size > flow.size:
         where = flow.error.where
