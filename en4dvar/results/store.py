@@ -29,6 +29,7 @@ from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
+from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
@@ -195,12 +196,8 @@ def posterior_file(run_dir: str | Path) -> Path:
     path = Path(run_dir) / "posterior.nc"
     require_settled(path.parent)
     if not path.is_file():
-        tables = [
-            f"{path.parent / kind}.csv" for kind in ("joint", "population") if path.with_name(f"{kind}.nc").exists()
-        ]
-        words = f"what several data sets say together is in {' and '.join(tables)}"
-        asked = words if tables else "is it the directory of a finished run?"
-        raise OutputError(f"{run_dir}: holds no posterior.nc; {asked}")
+        require_no_other(path.parent)
+        raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
     return path
 
 
