@@ -17,10 +17,12 @@ import numpy.typing as npt
 from scipy import special
 
 from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sides_of
+from en4dvar.data.noise.own import require_sound
 from en4dvar.data.series import Part, Series
 from en4dvar.model.state import Array, hold_floats
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
+from en4dvar.plumbing.hints import shown
 from en4dvar.priors.prior import LARGEST
 
 SEVERAL = ", "  # between the names of several sources
@@ -148,7 +150,10 @@ class Observations:
         if not np.all(self.weights >= 0):
             raise DataError(f"{where}: weights must not be negative")
         with retold(ValueError, DataError, f"{where}: "):
+            if not isinstance(self.noise, Noise):
+                raise ValueError(f"noise is {shown(self.noise)}; give a Noise, such as noise_of(std)")
             self.noise.check(self.weights)
+            require_sound(self.noise, self.weights)
         smallest, std = float(self.std.min()), float(self.std.max())
         if not (std < LARGEST and largest < LARGEST * smallest and smallest * LARGEST > 1):
             beside = f"an error std of {smallest if std < LARGEST else std:g} beside observations up to {largest:g}"

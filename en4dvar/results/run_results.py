@@ -10,9 +10,10 @@ from typing import TypeVar
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import datasets_in
 from en4dvar.results.checkpoint import CheckpointError, read_checkpoint
+from en4dvar.results.kinds import require_no_other
 from en4dvar.results.pack import PACK, Pack, file_names, known_pack, read_result, results_of
 from en4dvar.results.provenance import IDENTITY, Identity
-from en4dvar.results.store import StoredResult, load_stored, require_settled
+from en4dvar.results.store import StoredResult, load_stored, posterior_file, require_settled
 
 R = TypeVar("R")
 MOST_NAMES = 20
@@ -32,11 +33,13 @@ class LackingError(OutputError):
 class RunResults:
     """The results of a run directory, by name; of a single data set ``posterior.nc``, which need not exist. ``files``:
     where they are; ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as
-    they are read. Raises :class:`OutputError`: a run was killed as it replaced another.
+    they are read. Raises :class:`OutputError`: a run was killed as it replaced another, or is of another kind.
     """
 
     def __init__(self, run_dir: Path):
         require_settled(run_dir)
+        if not has_results(run_dir):
+            require_no_other(run_dir)
         self.run_dir, self.whole = run_dir, run_dir / "posterior.nc"
         self.lacking: dict[str, str] = {}
         self._read = False
@@ -98,6 +101,8 @@ def result_files(run_dir: Path) -> list[Path]:
     """
     results = RunResults(run_dir)
     results.check()
+    if results.files == [results.whole]:
+        posterior_file(run_dir)  # says what is missing
     return results.files
 
 

@@ -29,6 +29,7 @@ from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
+from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
@@ -195,10 +196,8 @@ def posterior_file(run_dir: str | Path) -> Path:
     path = Path(run_dir) / "posterior.nc"
     require_settled(path.parent)
     if not path.is_file():
-        of_several = [name for name in ("joint", "population") if path.with_name(f"{name}.nc").exists()]
-        tables = " and ".join(f"{path.parent / name}.csv" for name in of_several)
-        said = f"what several data sets say together is in {tables}" if tables else ""
-        raise OutputError(f"{run_dir}: holds no posterior.nc; {said or 'is it the directory of a finished run?'}")
+        require_no_other(path.parent)
+        raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
     return path
 
 

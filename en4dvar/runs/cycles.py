@@ -75,6 +75,7 @@ class Cycles(RunKind[R]):
 
     units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)
+    readers = ("report", "rerun", "compare", "export")
     summary: ClassVar["staticmethod[[Any], str]"]
     config: Any
     on_cycle: Callable[[int], None] | None = None

@@ -1,7 +1,7 @@
 """A kind of run, declared: its files, what it is made of, how its units of work are combined, and its page.
 
 The engine does the rest, the same for every kind: it claims the directory and locks it, keeps what is done, resumes,
-answers interrupts, puts the result in place and writes the page. :data:`KINDS` lists the kinds.
+answers interrupts, puts the result in place and writes the page. :mod:`en4dvar.results.kinds` lists the kinds.
 """
 
 from abc import ABC, abstractmethod
@@ -20,6 +20,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
+from en4dvar.results.kinds import kind_in
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
@@ -31,16 +32,6 @@ S = TypeVar("S")
 Tell = Callable[[int, int], None]  # how many are done, and of how many
 REPORT = "report.html"
 FIGURES = ("figures/*.png", "figures/*.pdf")
-KINDS = {
-    "estimate": "en4dvar.runs.runner:EstimateKind",
-    "sequence": "en4dvar.runs.cycles:SequenceKind",
-    "twin": "en4dvar.runs.cycles:TwinKind",
-    "design": "en4dvar.runs.design_run:DesignKind",
-    "sweep-twin": "en4dvar.runs.twin_sweep:SweepKind",
-    "calibrate": "en4dvar.runs.calibration_run:CalibrationKind",
-    "joint": "en4dvar.runs.together:JointKind",
-    "population": "en4dvar.runs.together:PopulationKind",
-}
 
 
 class Kind:
@@ -50,7 +41,8 @@ class Kind:
     can be written again: names relative to the directory, in which ``*`` stands for any text. A file of such a name
     that no run wrote is never replaced. ``result``: the one of ``files`` by which a finished run of this kind is known.
     ``writer``: ``module:function`` that writes the page into a folder from its files, imported when it is wanted, for
-    what draws pages is slow to import; of a page with figures also told whether to keep these as files.
+    what draws pages is slow to import; of a page with figures also told whether to keep these as files. ``readers``:
+    the commands that read a finished run of this kind.
     """
 
     name: ClassVar[str]
@@ -58,6 +50,7 @@ class Kind:
     pages: ClassVar[tuple[str, ...]] = ()
     result: ClassVar[str]
     writer: ClassVar[str] = ""
+    readers: ClassVar[tuple[str, ...]] = ("report",)
 
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
@@ -119,18 +112,6 @@ class RunKind(Kind, ABC, Generic[R]):
 
     def stop(self) -> None:
         """End what computes in threads of this process."""
-
-
-def kind_named(name: str) -> type[Kind]:
-    """The declaration of a kind. Raises :class:`KeyError`."""
-    declared: type[Kind] = resolve_name(KINDS[name])
-    return declared
-
-
-def kind_in(folder: Path) -> type[Kind]:
-    """The kind of the finished run in ``folder``; that of an estimate where there is no result of another kind."""
-    kinds = map(kind_named, KINDS)  # that of an estimate first
-    return next((kind for kind in kinds if (folder / kind.result).is_file()), kind_named("estimate"))
 
 
 @dataclass
@@ -265,7 +246,7 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
     run wrote would be replaced. :class:`LackingError`: results of some data sets cannot be read; the page names them.
     """
     with RunDirectory.open(path, "report") as directory:
-        kind = kind_in(directory.work)
+        kind: type[Kind] = kind_in(directory.work)
         directory.claim(*(name for name in kind.pages if figures or name not in FIGURES))
         try:
             page = kind.page(directory.work, datasets, workers, figures)

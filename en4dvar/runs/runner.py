@@ -88,6 +88,7 @@ class EstimateKind(RunKind[Campaign]):
 
     name = "estimate"
     result = "posterior.nc"
+    readers = ("report", "rerun", "compare", "export", "joint", "population")
     files = (
         result, PACK, ENDED, ITERATIONS, JointKind.result, PopulationKind.result, *JointKind.records,
         *PopulationKind.records, f"{GROUPS}/*/{PopulationKind.result}",

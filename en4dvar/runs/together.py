@@ -226,6 +226,7 @@ class PopulationKind(TogetherKind):
     what = "population"
     fewest = FEWEST_SETS
     result = stored.POPULATION
+    readers = ("report", "compare")
     files = (result,)
     records = (f"{FOLDER}/population", f"{FOLDER}/population_groups_*")
     pages = ("population.html", "population.csv", "population.tex")

@@ -165,6 +165,7 @@ class SweepKind(RunKind[TwinSweep]):
     name = "sweep-twin"
     units = "finished runs"
     result = "sweep.csv"
+    readers = ()
     files = (result, "runs.csv", f"{FOLDER}/*.run")
 
     config: TwinConfig

@@ -145,7 +145,7 @@ def test_files_and_faults(one: Path, tmp_path: Path) -> None:
         done = call(tmp_path / "nowhere", flag)
         assert (done.exit_code, done.stderr.count("holds no posterior.nc")) == (2, 1)
     (tmp_path / "joint.nc").write_bytes(b"")
-    where = f"{tmp_path}: holds no posterior.nc; what several data sets say together is in {tmp_path / 'joint.csv'}"
-    assert call(tmp_path).stderr == f"{where}\n"
+    where = f"and no posterior.nc of an estimate; its numbers are in {tmp_path / 'joint.csv'}; it is read by"
+    assert call(tmp_path).stderr == f"{tmp_path}: holds a run of the kind joint, {where} en4dvar report\n"
     with pytest.raises(OutputError, match=re.escape(where)):
         load_result(tmp_path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from en4dvar.runs.engine import KINDS
+from en4dvar.results.kinds import KINDS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -10,7 +10,7 @@ from kills import survive
 from siege import ATTACKED, KINDS, Siege, besiege
 from siege_commands import commands
 
-from en4dvar.runs.engine import KINDS as KINDS_OF_RUNS
+from en4dvar.results.kinds import KINDS as KINDS_OF_RUNS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="forks of POSIX")]
 CONTINUED = [*KINDS_OF_RUNS, "run, chain", "sweep", "study"]

@@ -19,7 +19,8 @@ from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report import TABLES
-from en4dvar.runs.engine import IDENTITY, KINDS, kind_in, kind_named
+from en4dvar.results.kinds import KINDS, kind_in, kind_named
+from en4dvar.runs.engine import IDENTITY
 from en4dvar.runs.rundir import LISTING, OF_EVERY_RUN, RunDirectory
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -88,6 +89,7 @@ def test_what_is_written_is_declared(
     assert {file for file in written if not any(fnmatch(file, known) for known in (*declared(name), IDENTITY))} == set()
     assert set((out / LISTING).read_text().splitlines()) == written
     assert kind_in(out) is kind_named(name)
+    assert ("report" in kind_named(name).readers) == bool(kind_named(name).pages)
     if kind_named(name).pages:
         page = call(prepared, "report", out)
         assert page.exit_code == 0, page.output
@@ -95,6 +97,29 @@ def test_what_is_written_is_declared(
         again = call(prepared, *WORKED[name], "--out", out, *([] if name in IN_PLACE else ["--force"]))
         assert again.exit_code == 0, again.output
         assert set(contents(out)) - {LISTING} == written
+
+
+READ = {"rerun": (), "export": (), "compare": ("again",), "joint": (), "population": ("--of", "k")}
+
+
+@pytest.mark.parametrize("command", READ)
+@pytest.mark.parametrize("name", KINDS)
+def test_a_command_that_does_not_read_a_kind_of_run_names_it_and_those_that_do(
+    tmp_path: Path, name: str, command: str
+) -> None:
+    """Only the result's file is there, and empty: what reads it says that it is damaged."""
+    kind = kind_named(name)
+    for folder in ("done", "again"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / kind.result).write_bytes(b"")
+    done = call(tmp_path, command, "done", *READ[command])
+    told = f"done: holds a run of the kind {name}, and no posterior.nc of an estimate"
+    if command in kind.readers:
+        assert told not in done.stderr
+    else:
+        assert done.exit_code == 2
+        assert told in done.stderr
+        assert all(f"en4dvar {reader}" in done.stderr for reader in kind.readers)
 
 
 @pytest.mark.fault("own-files")

@@ -86,5 +86,5 @@ def test_everything_that_decides_the_numbers_is_recorded(tmp_path, changes):
 
 
 def test_no_run(tmp_path):
-    with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
+    with pytest.raises(OutputError, match=r"holds no posterior\.nc; is it the directory of a finished run"):
         rerun(tmp_path)

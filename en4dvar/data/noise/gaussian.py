@@ -118,6 +118,8 @@ class Noise:
     def check(self, weights: Array) -> None:
         """Raise :class:`ValueError` where the errors of K observations with these weights (K,) are not well defined."""
         for key in ("std", "time_std"):
+            if isinstance(getattr(self, key), list | tuple):
+                raise ValueError(f"{key} is no array; give np.array({key})")
             if np.shape(getattr(self, key)) != weights.shape:
                 raise ValueError(f"{key} has shape {np.shape(getattr(self, key))}, not {weights.shape}")
         if not (np.all(self.std > 0) and np.all(self.time_std >= 0)):

@@ -271,7 +271,8 @@ def correlation_of(noise: Noise) -> csr_array:
     if isinstance(noise, CorrelatedNoise):
         return csr_array(noise.correlation.matrix)
     if type(noise) not in (Noise, HuberNoise, BoundNoise, BlockNoise):
-        raise ValueError("a discrepancy of the model is not possible beside other series; leave one of them out")
+        what = "a discrepancy of the model is" if noise.discrepant else f"errors of the kind {type(noise).__name__} are"
+        raise ValueError(f"{what} not possible beside other series; leave one of them out")
     return eye_array(len(noise.std), format="csr")
 
 
