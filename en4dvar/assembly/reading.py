@@ -138,7 +138,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 
     def errors(part: slice) -> Noise:
         stated = {key: column[part] for key, column in beside.items()}
-        return errors_of(data, read.times[part] - zero, values, stated, partial(read.rows_among, used=part))
+        rows = partial(read.rows_among, used=part)
+        return errors_of(data, read.times[part] - zero, values, stated, step_of(read.times), rows)
 
     try:
         until = read.window(asked.start, asked.until, asked.prominence).stop
@@ -171,20 +172,31 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
 
 
+def step_of(times: Array) -> float:
+    """The median time between readings; 0 of a single one."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+
+
 def errors_of(
-    data: Data, times: Array, values: Array, stated: Mapping[str, Array], rows: Callable[[int], Rows] = np.arange
+    data: Data,
+    times: Array,
+    values: Array,
+    stated: Mapping[str, Array],
+    step: float,
+    rows: Callable[[int], Rows] = np.arange,
 ) -> Noise:
     """The observation errors at ``times`` (K,).
 
     ``values`` are those in the window. ``stated``: ``std``, ``time_std``, ``shared 0`` and so on, ``at_most`` and
-    ``at_least`` (K,) where columns of the file hold them. ``rows``: where the observations stand in a covariance file
-    of so many rows, see :meth:`~en4dvar.inputs.readers.Readings.rows_among`.
+    ``at_least`` (K,) where columns of the file hold them. ``step``: the time between readings. ``rows``: where the
+    observations stand in a covariance file of so many rows, see
+    :meth:`~en4dvar.inputs.readers.Readings.rows_among`.
     """
     error, correlation = data.error, cast(Array | SharedErrors | DecayingErrors | None, None)
     largest = float(values.max())
     kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
-    timing = stated.get("time_std")
-    time_std = np.full(len(times), error.time_std) if timing is None else timing
+    timing = error.time_std.absolute(step) if isinstance(error.time_std, Spread) else error.time_std
+    time_std = stated["time_std"] if isinstance(timing, Column) else np.full(len(times), timing)
     if error.covariance is not None:
         covariance = read_covariance(error.covariance)
         with retold(DataError, DataError, f"{error.covariance.path}: "):

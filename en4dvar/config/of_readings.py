@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 
 from en4dvar.config.context import PLACEHOLDER, TEXT, Context, Faults, Made
-from en4dvar.config.quantities import Spread, Unit, observable_unit, quantity, read_spread, time_unit, unit_of
+from en4dvar.config.quantities import Spread, Unit, observable_unit, quantity, read_spread, share_of, time_unit, unit_of
 from en4dvar.config.schema import OfReadings, Section
 from en4dvar.data.extrema import minima
 from en4dvar.data.noise import SMOOTHNESS, Kernel
@@ -54,7 +54,8 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
 
 
 read_error_std = or_column(read_spread, observable_unit)
-read_time_std = or_column(quantity(time_unit, "not negative", error=True).make, time_unit)
+_TIME_STD = quantity(time_unit, "not negative", error=True)
+read_time_std = or_column(lambda text, context: share_of(text, "step") or _TIME_STD.make(text, context), time_unit)
 
 
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
@@ -153,8 +154,9 @@ class Error(Section):
         None, alias=f"{PLACEHOLDER}_std"
     )
     """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one per reading."""
-    time_std: Annotated[float | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
-    """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
+    time_std: Annotated[float | Spread | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
+    """Std of the observation times, a quantity, e.g. '5 % of step' (the median time between the readings of a file), or
+    ``{column: NAME}``: adds (rate × time_std)²."""
     model_std: Annotated[Spread | None, Made(read_spread)] = None
     """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None

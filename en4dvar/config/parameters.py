@@ -338,7 +338,9 @@ def entries(kind: str = "") -> Made:
         def unknown(name: str) -> str:
             if kind and name in of_readings:
                 return f"{kind} makes its own readings: keys of their own say when and with which errors"
-            return f"unknown parameter {shown(name)}{suggest(name, labels)}"
+            needed = model.absent_parameters.get(name)
+            hint = f"; the model has it only with {needed}" if needed else suggest(name, labels)
+            return f"unknown parameter {shown(name)}{hint}"
 
         defaults = {name: float(value) for name, value in model.defaults.items() if name in known}
         parameters: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}

@@ -173,7 +173,7 @@ def brief(rows: Sequence[ParameterSummary]) -> str:
     words = []
     for row in rows[:MOST_BRIEF]:
         digits = max(0, 1 - math.floor(math.log10(row.std))) if 0 < row.std < math.inf else 4
-        value = f"{row.mean:.{min(digits, 9)}f} ± {row.std:.{min(digits, 9)}f}"
+        value = f"{row.mean:.{digits}f} ± {row.std:.{digits}f}" if digits < 7 else f"{row.mean:.4g} ± {row.std:.2g}"
         if row.modal:
             value = f"{row.q05:.3g} to {row.q95:.3g}"
         elif row.untrusted:

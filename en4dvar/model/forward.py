@@ -261,6 +261,7 @@ class ForwardModel(ABC):
     :mod:`en4dvar.diagnosis.response.ledger`. ``optional_parameters`` are numbers that are known unless
     ``parameters:`` names them: :meth:`with_parameters` is the model in which they are parameters too; a setting in
     ``known_by`` says nothing but the numbers of these names, and is refused beside parameters for all of them.
+    ``absent_parameters``: numbers that the model has with other settings only, each with these settings in words.
 
     ``defaults`` are values (SI) of parameters that ``parameters:`` need not name.
 
@@ -290,6 +291,7 @@ class ForwardModel(ABC):
     path_quantities: tuple[PathQuantity, ...] = ()
     path_parameters: tuple[str, ...] = ()
     optional_parameters: tuple[Parameter, ...] = ()
+    absent_parameters: Mapping[str, str] = MappingProxyType({})
     known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
     _begins: float = 0.0  # on the clock of the paths, where ``trajectories`` begin

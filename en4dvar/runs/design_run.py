@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.assembly.build import discrepancy_terms, inverse_plan, needed_file, problem_of
-from en4dvar.assembly.reading import errors_of, read_observations
+from en4dvar.assembly.reading import errors_of, read_observations, step_of
 from en4dvar.config import Config, resolve
 from en4dvar.config.design import Value
 from en4dvar.config.document import Document, document_from, override
@@ -348,7 +348,7 @@ def _observations(
             observable=planned.observable,
             times=times,
             values=own,
-            noise=errors_of(planned.data, times, own, {})
+            noise=errors_of(planned.data, times, own, {}, step_of(times))
             if stated
             else noise_of(np.ones(len(times)), np.zeros(len(times))),
             name=planned.name,

@@ -209,20 +209,40 @@ class Dynamics:
     @cached_property
     def optional_parameters(self) -> tuple[Parameter, ...]:
         """The :mod:`numbers` that the equations contain."""
-        heat, transport = self.gas == "heat", self.vapour == "transport"
         pulse = {number.parameter.name: number.parameter for number in self.driving.numbers}
-        acts = {p.name: not p.name.startswith("pulse_") for p in ALL} | dict.fromkeys(pulse, True)
-        acts |= dict.fromkeys(("A", "B"), heat) | dict.fromkeys(("K_m", "c_m"), bool(self.system.wall))
-        acts |= dict.fromkeys(("tait_B", "tait_n"), self.radial in ("keller-miksis-enthalpy", "gilmore"))
-        acts |= dict.fromkeys(("D_v", "D_p", "D_T", ACCOMMODATION.name), transport)
-        acts |= dict.fromkeys(("L_v", "M_v"), transport and bool(self.system.wall))
+        return tuple(pulse.get(p.name, p) for p in ALL if self._contains[p.name][0])
+
+    @property
+    def absent_parameters(self) -> Mapping[str, str]:
+        """The other numbers, each with the settings with which the equations contain it."""
+        return {name: needed for name, (there, needed) in self._contains.items() if not there}
+
+    @cached_property
+    def _contains(self) -> Mapping[str, tuple[bool, str]]:
+        """Number → whether the equations contain it, and with which settings they do."""
+        heat, transport, wall = self.gas == "heat", self.vapour == "transport", bool(self.system.wall)
+        pulse = {number.parameter.name for number in self.driving.numbers}
+        of_pulse = "a driving that has it (docs/physics.md)"
+        acts = {p.name: (not p.name.startswith("pulse_") or p.name in pulse, of_pulse) for p in ALL}
+        acts |= dict.fromkeys(("A", "B"), (heat, "gas: heat"))
+        acts |= dict.fromkeys(("K_m", "c_m"), (wall, "medium_heat: conducting"))
+        tait = self.radial in ("keller-miksis-enthalpy", "gilmore")
+        acts |= dict.fromkeys(("tait_B", "tait_n"), (tait, "radial: keller-miksis-enthalpy or gilmore"))
+        acts |= dict.fromkeys(("D_v", "D_p", "D_T", ACCOMMODATION.name), (transport, "vapour: transport"))
+        both = "vapour: transport and medium_heat: conducting"
+        acts |= dict.fromkeys(("L_v", "M_v"), (transport and wall, both))
         # a constant vapour pressure would not follow the temperature
-        acts |= {"p_v": self.vapour == "none", "T_inf": (heat or self.vapour != "none") and not self.medium.p_v}
-        acts |= {"c": self.radial != "rayleigh-plesset", "kappa": self.gas != "isothermal"}
-        acts |= {WALL_DISTANCE.name: self.wall is not None}
-        acts |= {P_A.name: not self.driving.silent, "surface_tension": not self.law.rest_tension}
-        acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
-        return tuple(pulse.get(p.name, p) for p in ALL if acts[p.name])
+        warm = (heat or self.vapour != "none") and not self.medium.p_v
+        acts |= {
+            "p_v": (self.vapour == "none", "vapour: none"),
+            "T_inf": (warm, "gas: heat or a vapour, and no constant vapour pressure"),
+            "c": (self.radial != "rayleigh-plesset", "a radial other than rayleigh-plesset"),
+            "kappa": (self.gas != "isothermal", "a gas other than isothermal"),
+            WALL_DISTANCE.name: (self.wall is not None, "wall: {distance: …}"),
+            P_A.name: (not self.driving.silent, "a driving"),
+            "surface_tension": (not self.law.rest_tension, "a law that has no tension of its own"),
+        }
+        return acts | dict.fromkeys((R_START.name, RDOT_START.name), (self.start == "acoustic", "start: acoustic"))
 
     def medium_of(self, values: Mapping[str, Array], axes: int = 0) -> Medium:
         """The medium of members with parameters name → (N,): constants that are parameters are (N, 1, …), with as

@@ -10,7 +10,7 @@ import pytest
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import WATER_25C, BubbleModel, NeoHookeanKelvinVoigt, get_law, histotripsy, silence, simulate
-from en4dvar_bubble.numbers import ALL, OF_MEDIUM
+from en4dvar_bubble.numbers import ALL, NAMES, OF_MEDIUM
 from en4dvar_bubble.paths import pack
 
 BASE = {"G": 2e3, "mu": 0.05, "R0": 5e-6}
@@ -138,5 +138,28 @@ def test_from_yaml(tmp_path):
 
 def test_a_number_that_the_equations_lack_is_unknown(tmp_path):
     asked = LASER + "\n  p_A: {prior: normal, mean: -24 MPa, std: 10 %}"
-    with pytest.raises(ConfigError, match=r"n\.yaml:13:.*unknown parameter 'p_A'"):
+    with pytest.raises(
+        ConfigError, match=r"n\.yaml:13:.*unknown parameter 'p_A'; the model has it only with a driving"
+    ):
         load_config(_config(tmp_path, asked, ", start: laser"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "needed"),
+    [
+        ("wall_distance: {from_file: h_um, unit: um}", r"wall: \{distance: …\}"),
+        ("accommodation: 0.4", "vapour: transport"),
+        ("pulse_width: 1 us", "a driving that has it"),
+        ("R_start: 20 um", "start: acoustic"),
+    ],
+)
+def test_of_a_number_that_the_equations_lack_the_setting_is_named(tmp_path, asked, needed):
+    with pytest.raises(ConfigError, match=f"unknown parameter '[a-zA-Z_]+'; the model has it only with {needed}"):
+        load_config(_config(tmp_path, f"{LASER}\n  {asked}", ", start: laser"))
+
+
+def test_every_number_is_in_the_equations_or_has_a_setting_that_brings_it():
+    model = BubbleModel(law=get_law("newtonian"))
+    inside = {p.name for p in model.optional_parameters}
+    assert inside.isdisjoint(model.absent_parameters)
+    assert inside | set(model.absent_parameters) == NAMES

@@ -16,7 +16,7 @@ from toy_config import YAML, csv_text, write_toy
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell, _Warnings
 from en4dvar.config import load_config
-from en4dvar.estimation.summary import ParameterSummary
+from en4dvar.estimation.summary import ParameterSummary, brief
 from en4dvar.plumbing.caution import caution
 from en4dvar.report.result import load_result
 from en4dvar.results.pack import PACK
@@ -253,6 +253,15 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     refused = call("run", path, "--out", out, "--force")
     assert refused.exit_code == 2
     assert "was not written by a run" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "words"),
+    [(8.02e-9, 4.1e-10, "8.02e-09 ± 4.1e-10"), (1e3, 2e-6, "1000 ± 2e-06"), (0.4, 0.12, "0.40 ± 0.12")],
+)
+def test_a_small_number_keeps_its_digits_in_the_line_of_an_estimate(mean: float, std: float, words: str) -> None:
+    row = ParameterSummary("kappa_s", "", "", "kg/s", 0.0, 1.0, mean, std, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert brief([row]) == f"kappa_s {words} kg/s"
 
 
 def test_warnings_of_a_campaign_are_counted_by_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

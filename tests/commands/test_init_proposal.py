@@ -38,6 +38,16 @@ ELSEWHERE = {"rho": 998.0, "c": 1484.0, "p_inf": 101325.0, "reading_scale": 1.0,
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 
+def test_films_of_two_rates_have_each_its_own_error_of_the_times() -> None:
+    Path("films").mkdir()
+    header, *lines = write(Path("films", "fast.csv")).read_text(encoding="utf-8").splitlines()
+    Path("films", "slow.csv").write_text("\n".join([header, *lines[::3], ""]), encoding="utf-8")
+    done = call("init", "--data", "films")
+    assert done.exit_code == 0, done.output
+    steps = [float(p.observations.noise.time_std[0]) for p in build(load_config("films.yaml"))]
+    np.testing.assert_allclose(steps, [0.035e-6, 0.105e-6])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "times", "noise_std"),

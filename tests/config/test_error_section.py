@@ -42,6 +42,13 @@ def test_exponential_correlation(tmp_path: Path) -> None:
     assert np.array_equal(y.noise.time_std, np.full(31, 1e-5))
 
 
+def test_an_error_of_the_times_as_a_share_of_the_step(tmp_path: Path) -> None:
+    y = observations(tmp_path, (ERROR, f"{ERROR}, time_std: 10 % of step"))
+    np.testing.assert_allclose(y.noise.time_std, 5e-4)  # readings every 5 ms
+    with pytest.raises(ConfigError, match="is no share; write a number in % of step"):
+        observations(tmp_path, (ERROR, f"{ERROR}, time_std: 10 % of maximum"))
+
+
 def test_covariance_file(tmp_path: Path) -> None:
     r = write_matrix(tmp_path)
     y = observations(tmp_path, FROM_FILE)

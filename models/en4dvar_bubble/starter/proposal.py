@@ -60,6 +60,7 @@ STIFFENING = (0.12, 1.4)  # median and log_std of α
 SPAN = {"alpha": "agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
 LEAST_SHIFT = 0.1  # of the step between samples: of the prior of the clock
 TIMING = 0.05  # of the step between samples
+SAME_STEP = 1.1  # of films whose largest and smallest steps differ by less
 NUCLEUS = (0.66e-6, 0.8)  # m; both gels of Mancia et al. (2021), Table 1: 0.43 ± 0.31 and 1.3 ± 0.44 µm
 GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
 # Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
@@ -290,7 +291,8 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
     if np.isfinite(look.noise):
         std = _text(max(look.noise, LEAST_NOISE * look.lobe.R_max), "m", "um")
         words = "scatter of the readings where R is smooth; sigma below scales it"
-    timing = _text(TIMING * look.step, "s", "us")
+    alike = max(view.step for view in views) < SAME_STEP * min(view.step for view in views)  # else each has its own
+    timing = _text(TIMING * look.step, "s", "us") if alike else f"{100 * TIMING:g} % of step"
     key = "  time_std" if model.start == "laser" else "  # time_std"  # a flash is short
     return (
         *lines,
