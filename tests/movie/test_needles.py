@@ -11,7 +11,7 @@ from scipy.special import expit
 from en4dvar_movie.tracking import track
 
 SHAPE, CENTRE = (120, 144), (71.4, 60.3)
-RADII = [*(36 * (1 - np.linspace(0, 0.98, 12) ** 2) ** 0.5), 9.0, 11, 10, 7, 5.5, 6.3, 6.8, *[6.5] * 12]
+RADII = [*(36 * (1 - np.linspace(0, 0.98, 12) ** 2) ** 0.5), 9.0, 11, 10, 7, 5.5, 6.3, 6.8, *[6.5] * 5]
 
 
 def filmed(shade, radii=RADII, centre=CENTRE, seed=1, bright=False, scatter=2.5, stretch=1.0):

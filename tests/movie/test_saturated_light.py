@@ -40,7 +40,7 @@ def off(readings, radii=RADII):
     "shown",
     [
         [255 * (image > 75).astype(np.uint8) for image in filmed()],
-        [255 * (image > 130).astype(np.uint8) for image in filmed()],
+        pytest.param([255 * (image > 130).astype(np.uint8) for image in filmed()], marks=pytest.mark.slow),
         of_8_bit(filmed(light=400.0)),
         of_8_bit([3 * (160 - image) for image in filmed()]),
     ],

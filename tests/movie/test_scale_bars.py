@@ -11,7 +11,7 @@ from scipy.special import expit
 from en4dvar_movie.background import _burnt_in
 from en4dvar_movie.tracking import track
 
-RADII = np.array([*(52 * (1 - np.linspace(-0.95, 0.97, 21) ** 2) ** 0.5), 16, 19, 20, 19, 16, 12, 14, 15, *[13] * 7])
+RADII = np.array([*(52 * (1 - np.linspace(-0.95, 0.97, 14) ** 2) ** 0.5), 16, 19, 20, 19, 16, 12, 14, 15, *[13] * 4])
 
 
 def barred(empty=0, drift=(0.0, 0.0), texture=0.0, seed=1):

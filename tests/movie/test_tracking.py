@@ -235,7 +235,7 @@ def test_the_real_movie_agrees_with_a_person():
     assert [r.frame for r in found.readings if not r.used] == [0, 1, 2]
 
 
-@pytest.mark.parametrize("noise", [2.0, 10.0])
+@pytest.mark.parametrize("noise", [pytest.param(2.0, marks=pytest.mark.slow), 10.0])
 def test_a_bubble_that_covers_half_of_the_frame_is_no_change_of_light(noise):
     """The median brightness of such a frame is that of the bubble's edge."""
     radii = np.linspace(36.0, 43.0, 15)

@@ -126,7 +126,7 @@ def test_two_modes_of_a_constant_stay_two_however_many_weak_readings(seed):
     """Members that are no copies need no kernel, which draws modes together as it keeps the spread of all."""
     rng = np.random.default_rng(seed)
     members = np.stack([rng.standard_normal(400), np.zeros(400)], axis=1)
-    series = CycleSeries(np.arange(1.0, 301), 1.7 + 3 * rng.standard_normal((300, 1)), np.array([3.0]))
+    series = CycleSeries(np.arange(1.0, 151), 1.7 + 3 * rng.standard_normal((150, 1)), np.array([3.0]))
     run = run_sequential(Square(), Square.observables, members, series, SequentialSettings(BootstrapFilter()), seed)
     c = run.members[:, 0]
     assert 0.1 < np.mean(c > 0) < 0.9
