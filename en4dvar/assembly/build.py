@@ -22,6 +22,7 @@ from en4dvar.ensemble.tangent import derivatives_of
 from en4dvar.inputs.parts import Column, DataFile, Layout
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
+from en4dvar.plumbing.hints import beside
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -176,7 +177,7 @@ def needed_file(config: Config, times: object) -> dict[str, DataFile]:
         return {}
     name, file = next(iter(data_files(config.data).items()))
     if asking and not file.path.exists():
-        words = f"takes a value from the data, and {file.path} is not there; for an experiment to come, give a quantity"
+        words = f"takes a value from {file.path}: {beside(file.path)}; for an experiment to come, give a quantity"
         raise ConfigError([config.document.fault(("parameters", asked), words) for asked in asking])
     return {name: file}
 

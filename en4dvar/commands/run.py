@@ -123,7 +123,7 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         if name and n == 0:
             echo("\n" + "\n".join(group_lines(directory)))
         echo("\n".join(["", *[name] * bool(name), *population_lines(of)]))
-        warnings.add(f"population of {name}" if name else "population", of.cautions, whole=True)
+        warnings.add(f"the population of {name}" if name else "the population", of.cautions, whole=True)
 
 
 class _Warnings:
@@ -170,7 +170,8 @@ class _Warnings:
             which = [entry for entry in dict.fromkeys(entry[1] for entry in told) if entry not in wholes][:MOST_NAMED]
             if count > MOST_NAMED:
                 which[0] = f"{count} of {self.sets} data sets, worst {which[0]}"
-            yield f"{worst.kind}: {', '.join([*which, *wholes])}: {worst.code}; {worst.advice}"
+            who = " and ".join(", ".join(names) for names in (wholes, which) if names)
+            yield f"{worst.kind}: {who}: {worst.code}; {worst.advice}"
         if begun:
             codes = ", ".join(begun)
             yield f"note: the fits of the {self.sets} single data sets only begin the joint estimate: {codes}"

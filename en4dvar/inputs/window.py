@@ -8,6 +8,9 @@ known sign: it was chosen for its value, and those beside it were left out for t
 same instants by what no single sample decides: the vertex of a parabola through the samples about the maximum, and the
 middle between the two crossings of half the depth of a minimum, seen between the minima beside it.
 
+A minimum in a hole of the series, which no sample shows (:func:`~en4dvar.data.extrema.with_unseen`), counts as well: a
+window ends with the last sample before the hole, or begins with the first behind it.
+
 ``20 % of maximum`` is where a series has fallen to that share of its largest sample: a window begins with the first
 sample below it and ends with the last one before.
 
@@ -21,7 +24,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.data.extrema import minima
+from en4dvar.data.extrema import minima, with_unseen
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import shown
@@ -116,7 +119,8 @@ def index_of(
         return largest
     falls = instant.kind == "fall"
     below = np.flatnonzero(values[largest:] < instant.share * values[largest]) + largest - first - last
-    indices = below if falls else minima(values[first:], prominence)
+    t, y = with_unseen(times[first:], values[first:])
+    indices = below if falls else minima(y, prominence)
     if instant.number > len(indices):
         if instant.otherwise is not None:
             return index_of(times, values, instant.otherwise, first, prominence, last)
@@ -129,12 +133,13 @@ def index_of(
         advice = f"end it elsewhere ({elsewhere}), or lower its prominence"
         raise DataError(f"asks for minimum {instant.number}, but {few}; {advice}")
     index = int(indices[instant.number - 1])
+    if falls:
+        return first + index
+    at = t[index]
     if instant.kind == "trough":
-        begin, _, end = np.concatenate([[0], indices, [len(values) - first - 1]])[instant.number - 1 :][:3]
-        between = slice(first + begin, first + end + 1)
-        middle = _middle(times[between], values[between], index - begin)
-        return int(np.searchsorted(times, middle, "right")) - 1
-    return first + index
+        begin, _, end = np.concatenate([[0], indices, [len(y) - 1]])[instant.number - 1 :][:3]
+        at = _middle(t[begin : end + 1], y[begin : end + 1], index - begin)
+    return int(np.searchsorted(times, at, "right")) - (last or t[index] in times)
 
 
 def vertex(times: Array, values: Array) -> float:

@@ -205,19 +205,23 @@ def doubt(view: Lobe, medium: Medium, expected: Expected = NOTHING) -> str:
 
 
 def conceivable(view: Lobe, medium: Medium) -> bool:
-    """True if a gel up to :data:`EXTREME` collapses like this."""
+    """True if a gel up to :data:`EXTREME` collapses like this, and no diameters given as radii do."""
     least, largest = bounds(view.R_max, medium, EXTREME)
-    sure = 1 + view.margin
-    return least / sure <= view.rayleigh_ratio(medium) <= largest * sure
+    sure, ratio = 1 + view.margin, view.rayleigh_ratio(medium)
+    return least / sure <= ratio <= largest * sure and not _twice(SOFT / ratio)
 
 
 def _measured(ratio: float) -> str:
     return f"the collapse takes {ratio:.2g} of the Rayleigh time 0.915 R_max √(ρ/p∞)"
 
 
+def _twice(factor: float) -> bool:
+    return 2 / SAME_FACTOR < factor < 2 * SAME_FACTOR
+
+
 def _explained(factor: float) -> str:
     """What would make the history that of a usual bubble; ``factor`` is what its collapse time falls short by."""
-    if 2 / SAME_FACTOR < factor < 2 * SAME_FACTOR:
+    if _twice(factor):
         return "diameters given as radii? Or a time step, a pixel or a unit is wrong by a factor of 2"
     by = factor if factor > 1 else 1 / factor
     size, step = ("large", "short") if factor > 1 else ("small", "long")

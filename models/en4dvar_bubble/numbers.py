@@ -50,7 +50,11 @@ OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(
     | {"p_v": positive("p_v", "Pa", "constant vapour pressure in the bubble", "$p_v$", "", "kPa", common=True)}
 )
 """Constant of the medium → the parameter that sets it."""
-P_A = Parameter("p_A", "Pa", "normal", label="amplitude of the driving", symbol="$p_A$", display_unit="MPa")
+P_A = Parameter(
+    "p_A", "Pa", "normal", label="amplitude of the driving", symbol="$p_A$", display_unit="MPa", common=True
+)
+"""Common, for one transducer drives all bubbles of an experiment: an error of its hydrophone no number of them averages
+out."""
 _CONTENT = "amount of gas over that in equilibrium at the stress-free radius"
 GAS_CONTENT = positive("gas_content", "1", _CONTENT, r"$n_g/n_\mathrm{eq}$")
 R_START = positive("R_start", "m", "radius at time zero", "$R(0)$", "", "um")

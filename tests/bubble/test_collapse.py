@@ -11,7 +11,7 @@ from init_files import rebounding
 from scipy.io import loadmat
 
 from en4dvar_bubble import BubbleModel, collapse
-from en4dvar_bubble.collapse import RAYLEIGH, Expected, Gel, Lobe, bounds, conceivable, doubt, doubts, lobe
+from en4dvar_bubble.collapse import EXTREME, RAYLEIGH, Expected, Gel, Lobe, bounds, conceivable, doubt, doubts, lobe
 from en4dvar_bubble.medium import WATER_25C
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -89,6 +89,9 @@ def test_gels_beyond_what_is_usual_are_conceivable() -> None:
     assert stiff == pytest.approx(0.58, abs=0.01)
     assert conceivable(usual(stiff), WATER_25C)
     assert not conceivable(usual(0.5), WATER_25C)
+    unsure = replace(usual(0.53), margin=0.1)
+    assert bounds(unsure.R_max, WATER_25C, EXTREME)[0] < 0.53 * 1.1
+    assert not conceivable(unsure, WATER_25C)  # readings that scatter: still a diameter sooner than such a gel
     assert not conceivable(usual(3.0, 600e-6), WATER_25C)
 
 

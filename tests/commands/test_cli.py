@@ -291,7 +291,7 @@ def test_warnings_of_fits_that_only_begin_a_joint_estimate_are_one_line() -> Non
     told.add("all together", [caution("not-informed", "c")], whole=True)
     serious, of_both, begun, _ = told.lines()
     assert serious.startswith("warning: 6 of 6 data sets, worst set0, set1, set2: misfit; ")
-    assert of_both.startswith("note: 6 of 6 data sets, worst set0, set1, set2, all together: not-informed; ")
+    assert of_both.startswith("note: all together and 6 of 6 data sets, worst set0, set1, set2: not-informed; ")
     assert begun == "note: the fits of the 6 single data sets only begin the joint estimate: non-gaussian in 6"
 
 
@@ -301,13 +301,15 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
     for n in range(6):
         told.add(f"set{n}", [caution("misfit", "χ² is large")] * (n < 4))
     for gel in ("a", "b"):
-        told.add(f"population of {gel}", [caution("misfit", "in a"), caution("chain-not-converged", gel)], whole=True)
+        told.add(
+            f"the population of {gel}", [caution("misfit", "in a"), caution("chain-not-converged", gel)], whole=True
+        )
     lines = "\n".join(told.lines())
-    assert "4 of 6 data sets, worst set0, set1, set2, population of a, population of b: misfit; " in lines
-    assert "population of a, population of b: chain-not-converged; " in lines
+    assert "the population of a, the population of b and 4 of 6 data sets, worst set0, set1, set2: misfit; " in lines
+    assert "the population of a, the population of b: chain-not-converged; " in lines
     alone = _Warnings()
-    alone.add("population", [caution("chain-not-converged", "few draws")], whole=True)
-    assert "population: few draws" in "\n".join(alone.lines())
+    alone.add("the population", [caution("chain-not-converged", "few draws")], whole=True)
+    assert "the population: few draws" in "\n".join(alone.lines())
 
 
 def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """``en4dvar init`` of a coated bubble in water: what belongs to the water is not estimated, and no gel is spoken of."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from init_files import UNITS, call
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
+from en4dvar.problem import common_to
 from en4dvar_bubble.laws.tabulate import GRID, ends
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -34,6 +36,9 @@ def test_a_coated_bubble_in_water(law: str) -> None:
     assert "make G wrong" not in done.stderr
     assert "no G and mu" not in done.stderr
     (problem,) = build(load_config("s0.yaml"))
+    driving = problem.model.driving  # type: ignore[attr-defined]
+    assert 50e3 < driving.amplitude < 1e6  # as of a scanner, no pulse that tears tissue
+    assert driving.end > 3e-6
     assert problem.fixed["mu"] == pytest.approx(0.89e-3, rel=0.02)  # IAPWS 2008, 25 °C
     if "marmottant" in law:
         draws = np.random.default_rng(0).standard_normal((2000, len(problem.prior.names)))
@@ -47,6 +52,17 @@ def test_what_is_known_of_the_water_does_not_vary_from_bubble_to_bubble() -> Non
     assert done.exit_code == 0, done.output
     assert "  of: [chi, kappa_s, sigma_0] #" in Path("sh.yaml").read_text()
     assert call("validate", "sh.yaml").exit_code == 0
+
+
+def test_the_error_of_the_hydrophone_is_one_for_all_bubbles() -> None:
+    _films(3)
+    assert call("init", "--data", "sh", *UNITS, "--law", "marmottant-shell", *ASKED).exit_code == 0
+    text = Path("sh.yaml").read_text().replace("# p_A:", "p_A:")
+    for written, one in ((text, True), (re.sub(r"(p_A: .*)}", r"\1, shared: none}", text), False)):
+        Path("sh.yaml").write_text(written)
+        problems = build(load_config("sh.yaml"))
+        assert ("p_A" in common_to(problems, ["chi"])) == one
+        assert "rho" in common_to(problems, ["chi"])
 
 
 def test_a_law_without_any_value_says_so() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from en4dvar.data.extrema import maxima, minima
+from en4dvar.data.extrema import maxima, minima, with_unseen
 from en4dvar.inputs.window import Instant, parse_instant, select
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import UnitError
@@ -63,6 +63,27 @@ def test_top_and_trough() -> None:
     assert cut(few, "top", "end")[0] == 2.0  # no five samples about it: the largest
     assert parse_instant("top", "s") == Instant("top")
     assert parse_instant("trough 2", "s") == Instant("trough", 2)
+
+
+def test_a_minimum_in_a_hole_counts() -> None:
+    """It lies between the last sample before, in the fall, and the first behind, which falls from a top in the hole."""
+    kept = (T < 0.8) | (T > 1.6)
+    times, values = T[kept], BOUNCES[kept]
+    for kind in ("minimum", "trough"):
+        for number, end in ((1, 0.775), (2, 2.0), (3, 3.0)):
+            window = select(times, values, Instant("start"), Instant(kind, number))
+            assert times[window][-1] == pytest.approx(end), (kind, number)
+        window = select(times, values, Instant(kind), Instant("end"))
+        assert times[window][0] == pytest.approx(1.625), kind
+
+
+@pytest.mark.parametrize("begin", np.arange(0.4, 3.0, 0.2))
+def test_a_hole_in_one_fall_hides_no_minimum(begin: float) -> None:
+    kept = np.abs(T - begin - 0.4) > 0.4
+    falls = (np.cos(T * np.pi / 4), np.exp(-T), 5 - T, np.sqrt(17 - T**2), np.tanh(2 - T))
+    for values in falls:
+        for series in (values, values + 0.005 * np.random.default_rng(3).standard_normal(len(T))):
+            assert len(minima(with_unseen(T[kept], series[kept])[1])) == len(minima(series[kept]))
 
 
 def test_maxima_lie_behind_the_first_minimum() -> None:

@@ -17,6 +17,7 @@ from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_bubble.collapse import doubt
+from en4dvar_bubble.laws.base import ConstitutiveLaw
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.numbers import P_A, WALL_DISTANCE
@@ -67,12 +68,26 @@ class Known:
 
 SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: known to about 0.5 % from a calibration target")
 PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather changes it by 1 %, 100 m of altitude by 1.2 %: enter yours")
-AMPLITUDE = Entry(
-    f"# {P_A.name}",
-    "{prior: normal, mean: -24 MPa, std: 5 %}",
-    "amplitude of the driving: enter that of your pulse, with the error of your hydrophone, often 5 or 10 %",
-)
-"""A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
+HISTOTRIPSY = {"kind": "histotripsy", "amplitude": "-24 MPa", "frequency": "1 MHz", "exponent": "3.7", "delay": "5 us"}
+DIAGNOSTIC = {"kind": "sine", "amplitude": "100 kPa", "frequency": "2 MHz", "cycles": "8", "envelope": "hann"}
+
+
+def example_pulse(law: ConstitutiveLaw) -> Mapping[str, str]:
+    """Keys of a pulse and their values, as made such a bubble in published experiments: a coated one is driven by a
+    burst as of a scanner, one in a gel grows in the tension of a histotripsy pulse.
+    """
+    return DIAGNOSTIC if law.sized else HISTOTRIPSY
+
+
+def amplitude(pulse: Mapping[str, str]) -> Entry:
+    """A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
+    words = (
+        "amplitude of the driving, one for all bubbles (else add 'shared: none'): enter that of your pulse, with the "
+        "error of your hydrophone, often 5 or 10 %"
+    )
+    return Entry(f"# {P_A.name}", f"{{prior: normal, mean: {pulse['amplitude']}, std: 5 %}}", words)
+
+
 PULSE = (
     "the pulse is an example: enter that of your experiment in the line 'driving' of the model; the amplitude of the "
     "pulse is taken as exact, and an error of 10 % can {}; enter the error "

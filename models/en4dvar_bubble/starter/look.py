@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from en4dvar.data.extrema import minima
+from en4dvar.data.extrema import minima, with_unseen
 from en4dvar.inputs.implausible import scatter_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
@@ -150,6 +150,14 @@ SWINGS = 0.5  # of R_max: a bubble that rests above and then grows is driven; a 
 EQUAL = 1e-6  # of a level: what rounded readings that are equal differ by
 RESOLVED = 5.0  # standard deviations: of a level that is read, and is not what a camera shows of next to nothing
 FALLS = 0.9  # of R_max: readings that end above do not tell when it collapses
+COUNTED = (
+    "a window counts that collapse ('trough 1' lies in the hole), but its readings would tell more: recover "
+    "them if you can"
+)
+UNCOUNTED = (
+    "the minima behind are later ones ('trough 1' is not the first), and what a run makes of them may be wrong by a "
+    "factor of 2: leave the file out, or recover those readings"
+)
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
@@ -200,7 +208,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     peak = _lobe(times[:seen], radius[:seen], start != "laser" and np.isfinite(rests[0]))
     highest = top(times[:seen], radius[:seen], scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
-    prominence, n_minima = _minima(radius[largest:], scatter)
+    prominence, n_minima = _minima(with_unseen(times[largest:], radius[largest:])[1], scatter)
     rebound = second_maximum(radius)
     begins = _begins(radius, largest)
     first = float(radius[begins] / radius[largest])
@@ -221,7 +229,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     early, hole = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c), ""
     if seen < len(times) and chosen == "laser":
         early, rebound = True, float("nan")
-        hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses"
+        hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses; "
+        hole += UNCOUNTED if _unseen(times, radius) is None else COUNTED
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
         n_minima, prominence, falls, chosen == "laser" and not hole and (early or single(times, radius)), early,
@@ -232,12 +241,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
 def without_rebound(looks: Mapping[str, Look]) -> list[str]:
     """Which recordings end before the first rebound has a top, or have a hole there, and what to do."""
     short = [name for name, view in looks.items() if view.short]
-    holes = [
-        f"{name}: {view.hole}; the minima behind are later ones ('trough 1' is not the first), and what a run makes of "
-        "them may be wrong by a factor of 2: leave the file out, or recover those readings"
-        for name, view in looks.items()
-        if view.hole
-    ]
+    holes = [f"{name}: {view.hole}" for name, view in looks.items() if view.hole]
     if not short:
         return holes
     who = f"{listed(short, 5)}: " * (len(looks) > 1)
@@ -315,6 +319,8 @@ def _lobe(times: Array, radius: Array, rests: bool) -> Lobe:
 def _before_a_hole(times: Array, radius: Array) -> int:
     """How many readings precede a hole of several steps in which a bubble collapses and its rebound has a top; all."""
     largest, steps = int(np.argmax(radius)), np.diff(times)
+    if (at := _unseen(times, radius)) is not None:
+        return int(np.searchsorted(times, at))
     for last in largest + np.flatnonzero(steps[largest:] > SEVERAL * np.median(steps))[:1]:
         with suppress(DataError):  # too few to tell
             peak = lobe(times[: last + 1], radius[: last + 1])
@@ -322,6 +328,13 @@ def _before_a_hole(times: Array, radius: Array) -> int:
             if hidden and radius[last] < FALLS * radius[largest]:
                 return int(last) + 1
     return len(times)
+
+
+def _unseen(times: Array, radius: Array) -> float | None:
+    """When the first minimum behind the maximum is, if it is one that no reading shows and that a window counts."""
+    t, r = with_unseen(times[(largest := int(np.argmax(radius))) :], radius[largest:])
+    first = t[minima(r)[:1]]
+    return float(first[0]) if len(first) and first[0] not in times else None
 
 
 def _require_collapse(radius: Array, start: Start | None) -> None:

@@ -217,7 +217,7 @@ def starter(start: Start, law: str | None) -> Proposal:
         data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "top")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
-    lines += [elsewhere.AMPLITUDE] * (start == "acoustic")
+    lines += [elsewhere.amplitude(elsewhere.example_pulse(model.law))] * (start == "acoustic")
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
@@ -239,9 +239,13 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
 def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
     """The model, and how the file names its law. Raises :class:`ConfigError` where no such law starts so."""
     name = qualified(law) if law else LAWS[start]
-    settings = BubbleSettings.model_validate({**MODEL[start], "start": start, "law": name})
+    said: dict[str, object] = {**MODEL[start], "start": start, "law": name}
     with retold(ValueError, ConfigError, f"--law {name} --start {start}: "):
-        return BubbleModel.from_settings(settings), name
+        model = BubbleModel.from_settings(BubbleSettings.model_validate(said))
+        if start == "acoustic":
+            said |= {"driving": elsewhere.example_pulse(model.law)}
+            model = BubbleModel.from_settings(BubbleSettings.model_validate(said))
+    return model, name
 
 
 def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> tuple[dict[str, Look], list[str]]:
@@ -387,8 +391,8 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
         *[Entry("viscosity_change", "1", WHY["viscosity_change"])] * _in_a_liquid(model),
     ]
     if start == "acoustic":
-        pulse = "{kind: histotripsy, amplitude: -24 MPa, frequency: 1 MHz, exponent: 3.7, delay: 5 us}"
-        lines.append(Entry("driving", pulse, "enter the pulse of your experiment"))
+        pulse = ", ".join(f"{key}: {value}" for key, value in elsewhere.example_pulse(model.law).items())
+        lines.append(Entry("driving", f"{{{pulse}}}", "an example: enter the pulse of your experiment"))
     return tuple(lines)
 
 
@@ -418,7 +422,7 @@ def _parameters(
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = water[R_EQ.name]
     lines += radii.values()
-    lines += [elsewhere.AMPLITUDE] * (start == "acoustic")
+    lines += [elsewhere.amplitude(elsewhere.example_pulse(model.law))] * (start == "acoustic")
     mean, std = (0.0, CLOCK_STD) if start == "acoustic" else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
