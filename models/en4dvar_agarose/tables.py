@@ -46,14 +46,15 @@ def table(study: Study, route: Route) -> list[Row]:
     for fit in study.every_fit:
         cells = []
         for q in QUANTITIES:
-            mean, std = fit.summary(route, q.name) if fit.has(q.name) else (np.nan, np.nan)
+            fixed = q.name in fit.problems[0].fixed
+            computed = fit.summary(route, q.name) if fixed or fit.estimated(q.name) else None
             true = study.true_values(fit.gel, q.name) * q.factor
             pairs: dict[Source, Pair | None] = {
                 "paper": TABLES[route].get(fit.gel, {}).get(fit.model, {}).get(q.name),
-                "computed": (mean * q.factor, std * q.factor) if fit.has(q.name) else None,
+                "computed": (computed[0] * q.factor, computed[1] * q.factor) if computed else None,
                 "truth": (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
             }
-            cells.append(Cell(q, pairs, fixed=fit.has(q.name) and not fit.estimated(q.name)))
+            cells.append(Cell(q, pairs, fixed))
         rows.append((fit, cells))
     return rows
 
