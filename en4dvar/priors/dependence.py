@@ -82,18 +82,10 @@ class Dependence:
         """L (m, m), lower triangular."""
         return np.asarray(np.linalg.cholesky(self.matrix))
 
-    @property
-    def log_det_root(self) -> float:
-        return float(np.sum(np.log(np.diag(self.root))))
-
     def whitened(self, y: Array) -> Array:
         """L⁻¹ y of standardised coordinates (…, m)."""
         flat = y.reshape(-1, y.shape[-1]).T
         return np.asarray(solve_triangular(self.root, flat, lower=True).T.reshape(y.shape))
-
-    def coloured(self, z: Array) -> Array:
-        """L z, of (…, m)."""
-        return np.asarray(z @ self.root.T)
 
     def among(self, names: Sequence[str]) -> "Dependence | None":
         """The block of those of its parameters that are in ``names``; None where fewer than two are left."""

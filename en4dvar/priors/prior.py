@@ -309,7 +309,7 @@ class Prior:
             return np.asarray(self.std * dz)
         y = np.array(dz, dtype=float)
         for columns, block in self._placed:
-            y[..., columns] = block.coloured(y[..., columns])
+            y[..., columns] = y[..., columns] @ block.root.T
         return np.asarray(self.std * y)
 
     def white_covariance(self, covariance: Array) -> Array:
@@ -323,7 +323,8 @@ class Prior:
     @cached_property
     def log_det_root(self) -> float:
         """½ ln det of the prior covariance in transformed space."""
-        return float(np.sum(np.log(self.std))) + sum(block.log_det_root for block in self.blocks)
+        of_blocks = sum(float(np.sum(np.log(np.diag(block.root)))) for block in self.blocks)
+        return float(np.sum(np.log(self.std))) + of_blocks
 
     def cost(self, x: Array) -> Array:
         """J_b (…,) of control vectors ``x`` (…, n): ½ ‖z‖² of their white coordinates z."""

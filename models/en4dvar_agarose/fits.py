@@ -75,9 +75,6 @@ class Fit:
             return np.asarray(self.sweep.theta[:, [p.name for p in self.sweep.parameters].index(name)])
         return np.array([np.nanmean(a.posterior[:, self.prior.names.index(name)]) for a in self.analyses])
 
-    def has(self, name: str) -> bool:
-        return name in self.prior.names or name in self.problems[0].fixed
-
     def estimated(self, name: str) -> bool:
         return name in self.prior.names
 

@@ -130,7 +130,7 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model
     with choose_executor(model, workers=workers) as executor:
-        work = _Parts(plan, executor, workers, say or (lambda message: None), keep, {})
+        work = _Parts(plan, executor, say or (lambda message: None), keep, {})
         with work.timed("sweep"):
             sweeps = work.sweeps(problems)
         with work.timed("en4dvar"):
@@ -149,7 +149,6 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
 class _Parts:
     plan: StudyPlan
     executor: Executor
-    workers: int
     say: Say
     keep: StudyCheckpoints | None
     seconds: dict[str, float]

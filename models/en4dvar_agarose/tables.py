@@ -11,8 +11,8 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report import text
 from en4dvar.report.export import column_name, render_latex
 from en4dvar.sampling.sweep import SweepResult
-from en4dvar_agarose.fits import Study
-from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
+from en4dvar_agarose.fits import Fit, Study
+from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Quantity, Route
 
 Pair = tuple[float, float]  # mean and standard deviation
 Source = Literal["paper", "computed", "truth"]
@@ -37,29 +37,26 @@ class Cell:
         return f"{pair[0]:.3g} (fixed)" if self.fixed and pair and source == "computed" else plus_minus(pair)
 
 
-@dataclass(frozen=True)
-class Row:
-    gel: str
-    model: Model
-    cells: tuple[Cell, ...]
+Row = tuple[Fit, list[Cell]]  # of a gel and a model
 
 
-def table(study: Study, route: Route) -> tuple[Row, ...]:
+def table(study: Study, route: Route) -> list[Row]:
     """The rows of table 1 (``sweep``) or 2 (``en4dvar``), in the units of the paper."""
     rows = []
     for fit in study.every_fit:
         cells = []
         for q in QUANTITIES:
-            mean, std = fit.summary(route, q.name) if fit.has(q.name) else (np.nan, np.nan)
+            fixed = q.name in fit.problems[0].fixed
+            computed = fit.summary(route, q.name) if fixed or fit.estimated(q.name) else None
             true = study.true_values(fit.gel, q.name) * q.factor
             pairs: dict[Source, Pair | None] = {
                 "paper": TABLES[route].get(fit.gel, {}).get(fit.model, {}).get(q.name),
-                "computed": (mean * q.factor, std * q.factor) if fit.has(q.name) else None,
+                "computed": (computed[0] * q.factor, computed[1] * q.factor) if computed else None,
                 "truth": (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
             }
-            cells.append(Cell(q, pairs, fixed=fit.has(q.name) and not fit.estimated(q.name)))
-        rows.append(Row(fit.gel, fit.model, tuple(cells)))
-    return tuple(rows)
+            cells.append(Cell(q, pairs, fixed))
+        rows.append((fit, cells))
+    return rows
 
 
 def plus_minus(pair: Pair | None) -> str:
@@ -80,11 +77,11 @@ def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
     """One line a gel, model and quantity, every digit kept; a comment says what is synthetic."""
     heads = [f"{source}_{moment}" for source in get_args(Source) for moment in ("mean", "std")]
     lines = [["gel", "model", "quantity", "unit", *heads]]
-    for row in rows:
-        for cell in row.cells:
+    for fit, cells in rows:
+        for cell in cells:
             values = [value for source in get_args(Source) for value in (cell.pairs[source] or (np.nan, np.nan))]
             numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-            lines.append([row.gel, LABELS[row.model], cell.quantity.name, cell.quantity.unit, *numbers])
+            lines.append([fit.gel, LABELS[fit.model], cell.quantity.name, cell.quantity.unit, *numbers])
     words = f"# {ROUTES[route]} on a SYNTHETIC twin of the paper's campaign; only the paper_ columns are printed\n"
     return f"{words if study.plan.synthetic else ''}{csv_text(lines)}"
 
@@ -101,11 +98,11 @@ def as_text(study: Study, rows: Sequence[Row], route: Route, suffix: Literal["md
 def _estimates(study: Study) -> Iterator[tuple[str, Cell, Pair, Pair]]:
     """Route, gel and law in words, and cell, of everything estimated that the paper prints; computed, then printed."""
     for route in ("sweep", "en4dvar"):
-        for row in table(study, route):
-            for cell in row.cells:
+        for fit, cells in table(study, route):
+            for cell in cells:
                 mine, paper = cell.pairs["computed"], cell.pairs["paper"]
                 if paper is not None and mine is not None and not cell.fixed:
-                    yield f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}", cell, mine, paper
+                    yield f"{ROUTES[route]}, {fit.gel}, {LABELS[fit.model]}", cell, mine, paper
 
 
 def disagreements(study: Study) -> list[str]:

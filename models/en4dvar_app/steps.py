@@ -27,29 +27,25 @@ OUTLINE = re.compile(r"(?:-?\d{1,5}(?:\.\d{1,9})?,-?\d{1,5}(?:\.\d{1,9})? ){3,}"
 Fields = Mapping[str, str]
 
 
-class FieldError(En4dvarError):
-    """A field of the page that is missing or cannot be."""
-
-
 def beside(movie: str, suffix: str) -> str:
     """The name of what belongs to a movie: its table, the corrections, the picture that says what is looked at."""
     return f"{movie.rpartition('.')[0] or movie}{suffix}"
 
 
 def existing(root: Path, fields: Fields, key: str) -> str:
-    """The name of a file or folder of ``root``, which holds no link that leads out of it. Raises FieldError: it is not
-    there, or it is a movie for which the table of another one is in the way.
+    """The name of a file or folder of ``root``, which holds no link that leads out of it. Raises En4dvarError: it is
+    not there, or it is a movie for which the table of another one is in the way.
     """
     name = fields.get(key, "")
     if not name:
-        raise FieldError(f"choose a {'configuration' if key == 'config' else key} first")
+        raise En4dvarError(f"choose a {'configuration' if key == 'config' else key} first")
     path = below(root, name)
     if not path.exists():
-        raise FieldError(f"{name}: is not in the folder any more")
+        raise En4dvarError(f"{name}: is not in the folder any more")
     for part in path.iterdir() if path.is_dir() else ():
         below(root, part.relative_to(root).as_posix())
     if key == "movie" and (other := other_movie(below(root, table := beside(name, TABLE)), path)):
-        raise FieldError(f"{table}: was read from {other}, to which its corrections belong; give {name} another name")
+        raise En4dvarError(f"{table}: was read from {other}, to which its corrections belong; give {name} another name")
     return name
 
 
@@ -68,7 +64,7 @@ def _track(root: Path, fields: Fields) -> list[str]:
     below(root, f"{Path(table).stem}.html")
     if below(root, table).exists():
         if not movie_of(root / table):
-            raise FieldError(f"{table}: is there and was not read from a movie; rename it first")
+            raise En4dvarError(f"{table}: is there and was not read from a movie; rename it first")
         words.append("--force")  # the same table, read anew
     return [*words, f"--out={table}"]
 
@@ -76,7 +72,7 @@ def _track(root: Path, fields: Fields) -> list[str]:
 def _init(root: Path, fields: Fields) -> list[str]:
     data, name = existing(root, fields, "table"), fields.get("proposal", "").strip()
     if not name or Path(name).name != name or name.startswith("."):
-        raise FieldError("give the new proposal a name without '/', such as gel.yaml")
+        raise En4dvarError("give the new proposal a name without '/', such as gel.yaml")
     out = _unused(root, f"{name.removesuffix('.yaml')}.yaml", "give the new proposal another name")
     return ["init", f"--data={data}", *_options(fields, OF_INIT), f"--out={out}"]
 
@@ -84,21 +80,21 @@ def _init(root: Path, fields: Fields) -> list[str]:
 def _unused(root: Path, name: str, otherwise: str) -> str:
     """The name of a file that is not there: no command of the page replaces what somebody may have edited."""
     if below(root, name).exists():
-        raise FieldError(f"{name}: exists and is not replaced; {otherwise}")
+        raise En4dvarError(f"{name}: exists and is not replaced; {otherwise}")
     return name
 
 
 def _config(root: Path, fields: Fields) -> str:
     name = existing(root, fields, "config")
     if not name.endswith((".yaml", ".yml")):
-        raise FieldError(f"{name}: is not a configuration by its suffix (.yaml)")
+        raise En4dvarError(f"{name}: is not a configuration by its suffix (.yaml)")
     return name
 
 
 def _run_dir(root: Path, fields: Fields) -> str:
     name = fields.get("run", "").strip()
     if not name or name in (".", "..") or "/" in name or "\\" in name or name.startswith("-"):
-        raise FieldError("give the run a name without '/'" if name else "give the run a name")
+        raise En4dvarError("give the run a name without '/'" if name else "give the run a name")
     below(root, f"runs/{name}")
     return f"runs/{name}"
 
@@ -111,7 +107,7 @@ def _run(root: Path, fields: Fields) -> list[str]:
 def _compare(root: Path, fields: Fields) -> list[str]:
     runs = [_run_dir(root, {"run": name}) for name in fields.get("runs", "").split("\n") if name]
     if len(runs) < 2:
-        raise FieldError("choose two runs or more")
+        raise En4dvarError("choose two runs or more")
     new = next(name for n in count(1) if not below(root, name := f"comparisons/{n}").exists())
     return ["compare", *runs, "--stored", f"--out={new}"]
 
@@ -122,7 +118,7 @@ def _export(root: Path, fields: Fields) -> list[str]:
     return ["export", run, f"--out={out}"]
 
 
-# The folder and fields → the words after ``en4dvar``. Raise FieldError, and OutputError for a path.
+# The folder and fields → the words after ``en4dvar``. Raise En4dvarError, of a path OutputError.
 STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
     "track": _track,
     "init": _init,
@@ -142,27 +138,27 @@ def text_of(root: Path, fields: Fields) -> str:
 
 
 def kept(root: Path, fields: Fields) -> None:
-    """Write a text of the page: a configuration that is there, or the corrections of a movie. Raises FieldError:
+    """Write a text of the page: a configuration that is there, or the corrections of a movie. Raises En4dvarError:
     another window or program has changed the file since the page read it.
     """
     path = _text_file(root, fields)
     held, text = text_of(root, fields), fields.get("text", "")
     if held not in (fields.get("before", ""), text):
-        raise FieldError(f"{path.name}: another window or program has changed it; load the page again to see it")
+        raise En4dvarError(f"{path.name}: another window or program has changed it; load the page again to see it")
     if held != text:
         write_text(path, text)
 
 
 def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
     """Blacken or (``uncovers``) whiten the polygon ``outline``, "x,y x,y ...", in the mask of a movie of (H, W) pixels.
-    Raises FieldError: the outline is none, or the mask is no picture of that size.
+    Raises En4dvarError: the outline is none, or the mask is no picture of that size.
     """
     path, outline = below(root, beside(existing(root, fields, "movie"), ".mask.png")), fields.get("outline", "")
     if not OUTLINE.fullmatch(f"{outline} "):
-        raise FieldError("draw around what shall not be looked at")
+        raise En4dvarError("draw around what shall not be looked at")
     picture = open_picture(path) if path.exists() else np.full(shape, 255, dtype=np.uint8)
     if picture.shape[:2] != shape:
-        raise FieldError(f"{path.name}: is no picture of the size of the frames; rename it first")
+        raise En4dvarError(f"{path.name}: is no picture of the size of the frames; rename it first")
     image = Image.fromarray(picture).convert("L")
     corners = [float(number) for number in re.split("[ ,]", outline)]
     ImageDraw.Draw(image).polygon(corners, fill=255 if fields.get("uncovers") else 0)

@@ -14,10 +14,6 @@ if TYPE_CHECKING:
     from en4dvar_bubble.laws import ConstitutiveLaw
 
 
-class CheckFailed(En4dvarError):
-    """A law does not pass the battery."""
-
-
 def completed_law(context: click.Context, parameter: click.Parameter, typed: str) -> list[str]:
     """Names of laws that the shell offers."""
     from en4dvar_bubble.laws.loading import available
@@ -47,7 +43,7 @@ def laws(names: tuple[str, ...], check: bool) -> None:
     else:
         click.echo("\n\n".join(_description(law, in_full=bool(names)) for law in chosen))
     if broken:
-        raise CheckFailed("\n".join(broken))
+        raise En4dvarError("\n".join(broken))
 
 
 def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
