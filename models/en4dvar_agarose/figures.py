@@ -170,8 +170,7 @@ def combined(study: Study, fit: Fit) -> Chart:
     """Histograms of all posterior members with prior, mean and (twin) the truths."""
     panels: list[Panel] = []
     for q in R0_FIRST:
-        values, j = fit.members(q.name) * q.factor, fit.prior.names.index(q.name)
-        prior = np.concatenate([a.prior[:, j] for a in fit.analyses]) * q.factor
+        values, prior = fit.members(q.name) * q.factor, fit.prior_members(q.name) * q.factor
         low, high = map(float, np.quantile(values, (0.001, 0.999)))
         edges = np.linspace(low, high, 31)
         panel = Panel(_label(q), yticks=(), left=False, legend=not panels)

@@ -103,6 +103,11 @@ class Fit:
         stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
         return np.asarray(stacked[np.isfinite(stacked)])
 
+    def prior_members(self, name: str) -> Array:
+        """(S·N,) members of the priors of all sets, SI."""
+        j = self.prior.names.index(name)
+        return np.concatenate([a.prior[:, j] for a in self.analyses])
+
 
 @dataclass(frozen=True)
 class Study:

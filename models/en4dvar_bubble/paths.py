@@ -205,7 +205,8 @@ def pack(
     rho = model.medium_of(own).rho
     initial, par = _states(model, x, own)
     n_members = len(x)
-    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE], pulse = model.driving.of_members(own)
+    clocks = model.driving.of_members(own)
+    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE] = clocks[:3]
     memory = viscous = _NO_TABLE
     if system.memory:
         memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
@@ -234,7 +235,7 @@ def pack(
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return members, memory, viscous, pulse
+    return members, memory, viscous, clocks.table
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:

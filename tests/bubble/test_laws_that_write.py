@@ -85,7 +85,7 @@ def numbers(law):
     values = law.example_values(2)
     memory = law.memory_tables(values)
     viscous = law.viscous_table(values) if law.shear_dependent or law.strain_dependent else 0.0
-    halved = law.refined(law.example_values())[0]
+    halved = law.refined(law.example_values()).table
     return [law.table(values), halved, viscous, memory.stiffness, *values.values()]
 
 

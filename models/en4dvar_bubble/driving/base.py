@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,13 @@ class Shape:
         return self.function(t, *self.numbers)
 
 
-Clocks = tuple[float | Array, float | Array, float | Array, Array]  # shift, rate, offset and table
+class Clocks(NamedTuple):
+    """How N members read the driving: at t_ref = (t − shift) · rate, in µs, from so many numbers on in the table."""
+
+    shift: float | Array
+    rate: float | Array
+    offset: float | Array
+    table: Array
 
 
 @dataclass(frozen=True)
@@ -96,9 +102,7 @@ class Driving:
         return table
 
     def of_members(self, values: Mapping[str, Array]) -> Clocks:
-        """How members read the driving: at t_ref = (t − shift) · rate, in µs, from so many numbers on in the table.
-        ``values``: name → (N,) of parameters, any of which may be :attr:`numbers`.
-        """
+        """How members read the driving; ``values``: name → (N,) of parameters, any of which may be :attr:`numbers`."""
         rate: float | Array = 1.0
         zero = next((number.value for number in self.numbers if number.role == "delay"), 0.0)
         delay: float | Array = zero
@@ -112,10 +116,10 @@ class Driving:
                 delay = value
             else:
                 rate = rate * (value / number.value if number.role == "rate" else number.value / value)
-        shift = 1e6 * (delay - zero / rate)
-        return self._of_shapes(shift, rate, shapes) if shapes else (shift, rate, 0.0, self.table)
+        clocks = Clocks(1e6 * (delay - zero / rate), rate, 0.0, self.table)
+        return self._of_shapes(clocks, shapes) if shapes else clocks
 
-    def _of_shapes(self, shift: float | Array, rate: float | Array, shapes: Mapping[str, Array]) -> Clocks:
+    def _of_shapes(self, clocks: Clocks, shapes: Mapping[str, Array]) -> Clocks:
         """The same where members have shapes of their own: each table is stretched to the span of this one."""
         assert self.remade is not None
         different, which = np.unique(np.column_stack(list(shapes.values())), axis=0, return_inverse=True)
@@ -123,8 +127,8 @@ class Driving:
         table = np.concatenate([replace(shape, cells=self.cells).table for shape in each])
         begin = np.array([1e6 * shape.begin for shape in each])[which]
         stretch = ((self.end - self.begin) / np.array([shape.end - shape.begin for shape in each]))[which]
-        shift = shift + (begin - 1e6 * self.begin / stretch) / rate
-        return shift, rate * stretch, np.asarray(8.0 * self.cells * which), table
+        shift = clocks.shift + (begin - 1e6 * self.begin / stretch) / clocks.rate
+        return Clocks(shift, clocks.rate * stretch, np.asarray(8.0 * self.cells * which), table)
 
     @cached_property
     def breaks(self) -> Array:
@@ -137,13 +141,13 @@ class Driving:
 
     def of_each(self, t: Array, values: Mapping[str, Array]) -> Array:
         """p_f (N, K) in Pa of members at their times (N, K) in s; ``values``: name → (N,) of parameters, as above."""
-        *clocks, tables = self.of_members(values)
-        shift, rate, offset = (np.reshape(of, (-1, 1)) for of in clocks)
+        clocks = self.of_members(values)
+        shift, rate, offset = (np.reshape(of, (-1, 1)) for of in clocks[:3])
         read = (t * 1e6 - shift) * rate
         span = self.grid.span
         inside = (read >= span[0]) & (read <= span[1])
         table = np.broadcast_to(offset[:, 0].astype(int) // (8 * self.cells), len(t))
-        shape = evaluate(tables.reshape(-1, self.cells, 8)[table], span, read)
+        shape = evaluate(clocks.table.reshape(-1, self.cells, 8)[table], span, read)
         amplitude = np.reshape(values.get("p_A", self.amplitude), (-1, 1))
         return np.where(inside, amplitude * shape, 0.0)
 

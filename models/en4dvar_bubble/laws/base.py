@@ -13,7 +13,7 @@ import numpy as np
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_file import is_from_file
-from en4dvar_bubble.laws.exactness import is_sharp, refine
+from en4dvar_bubble.laws.exactness import Refined, is_sharp, refine
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU, Values, columns
 from en4dvar_bubble.laws.tabulate import (
@@ -180,8 +180,8 @@ class ConstitutiveLaw:
         with np.errstate(all="ignore"):
             return from_strain_energy(partial(self.strain_energy_rate, p=p), members(values))
 
-    def refined(self, values: Mapping[str, Array]) -> tuple[Array, Array]:
-        """J_e of one member (``values``: name → (1,)) as :func:`refine` gives it, with cells halved where it takes."""
+    def refined(self, values: Mapping[str, Array]) -> Refined:
+        """J_e of one member (``values``: name → (1,)), with cells halved where it takes."""
         p = columns(values)
 
         def function(x: Array) -> Array:
@@ -254,7 +254,7 @@ class Liquid(ConstitutiveLaw):
 def _kept(law: ConstitutiveLaw, names: tuple[str, ...], numbers: bytes) -> Array:
     """The table of a sharp law for parameters ``names`` (n,) and the ``numbers`` (n, N) of members."""
     tables = [
-        law.refined(dict(zip(names, member[:, None], strict=True)))[0]
+        law.refined(dict(zip(names, member[:, None], strict=True))).table
         for member in np.frombuffer(numbers).reshape(len(names), -1).T
     ]
     most = max(map(len, tables))

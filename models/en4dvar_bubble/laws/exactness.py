@@ -4,7 +4,7 @@ has cells halved where it takes; what cannot be tabulated is refused, by name.
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -24,10 +24,18 @@ _TO_THE_END = 12  # halvings of the cell where a function ends: to 1e-5 of λ
 _BESIDE = np.array([-64, 64])  # cells: so near the end of a function it may grow without bound
 
 
-def refine(function: Callable[[Array], Array], slope: bool) -> tuple[Array, Array]:
-    """A table (cells, 8) on :data:`GRID`, with one cell more than it needs, of a function of ln λ (K,) → (K,), or of
-    that whose ``slope`` it is and which is zero at ln λ = 0. And ln λ (K,) of the middle of the cells that do not hold
-    the function to :data:`ERROR`: their coefficients are NaN.
+class Refined(NamedTuple):
+    """``table`` (cells, 8) of one member, with one cell more than it needs, and ``x``, ln λ of the middle of the cells
+    (K,) that hold the function to less than :data:`ERROR`: their coefficients are NaN.
+    """
+
+    table: Array
+    x: Array
+
+
+def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
+    """A table on :data:`GRID` of a function of ln λ (K,) → (K,), or of that whose ``slope`` it is and which is zero at
+    ln λ = 0.
 
     Each cell is compared with the function at nine points that it was not made from. What lies between them, at first
     1/160 apart, is not seen. Cells in which the function is finite at some points and not at others are halved, so
@@ -82,7 +90,7 @@ def refine(function: Callable[[Array], Array], slope: bool) -> tuple[Array, Arra
         begins = np.concatenate([begins, left])
     if slope:
         _add_up(records, begins)
-    return np.concatenate([records, np.zeros((1, 8))]), np.asarray(inexact, dtype=float)
+    return Refined(np.concatenate([records, np.zeros((1, 8))]), np.asarray(inexact, dtype=float))
 
 
 def _add_up(records: Array, begins: Array) -> None:
@@ -238,7 +246,7 @@ def refuse_inexact(kind: type[Any]) -> None:
     if not is_sharp(kind):
         return
     lowest, highest = law.stretch_range
-    inexact = np.exp(law.refined(law.example_values())[1])
+    inexact = np.exp(law.refined(law.example_values()).x)
     inexact = inexact[(inexact > lowest) & (inexact < highest)]
     if len(inexact):
         raise UnfitError(
