@@ -106,7 +106,9 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
 
 @dataclass(frozen=True)
 class _Linear:
-    """J with predictions linear about a mode: ``slopes`` (n', K) of white coordinates u, at ``rest`` (n',) there."""
+    """J with predictions linear about a mode: ``slopes`` (n', K) of u, which lies at ``rest`` (n',) there; white
+    coordinates.
+    """
 
     space: WeightSpace
     at: Predicted
@@ -210,7 +212,9 @@ def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: flo
 
 
 def _imposed(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> tuple[Array, float]:
-    """Draws (B, r) of N(0, I) exp(−cost) in place of draws ``z`` of N(0, I), by its powers, and ln E[exp(−cost)]."""
+    """Draws (B, r) of N(0, I) exp(−cost) in place of draws ``z`` of N(0, I), and ln E[exp(−cost)] of these: by powers
+    of exp(−cost), each of which leaves half of the draws effective.
+    """
     power, log_share = 0.0, 0.0
     while power < 1:
         costs, step = cost(z), 1 - power
@@ -225,7 +229,9 @@ def _imposed(z: Array, cost: Callable[[Array], Array], stream: np.random.Generat
 
 
 def _moved(z: Array, cost: Callable[[Array], Array], power: float, stream: np.random.Generator) -> Array:
-    """A move of each point z (N, r), of N(0, I) exp(−power · cost), on an ellipse whose arc shrinks until accepted."""
+    """A move of each point z (N, r), drawn from N(0, I) exp(−power · cost), along an ellipse through it, its arc shrunk
+    until the draw is accepted.
+    """
     other, level = stream.standard_normal(z.shape), power * cost(z) - np.log(stream.uniform(size=len(z)))
     angle = stream.uniform(0, 2 * np.pi, size=len(z))
     low, high = angle - 2 * np.pi, angle.copy()

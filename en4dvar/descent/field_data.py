@@ -143,7 +143,10 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
 
 
 def _observed(problem: InverseProblem, asked: Localisation) -> Array:
-    """Coordinates (K, D) of the readings at the begin of the model's clock. Raises :class:`ConfigError`."""
+    """Coordinates (K, D) of the readings, with the field carried back to the begin of the model's clock.
+
+    Raises :class:`ConfigError`.
+    """
     coordinates = []
     for part in problem.parts:
         block = field_of(problem.model, part.observable)

@@ -77,7 +77,9 @@ def _scores(study: Study) -> dict[Route, dict[str, Array]]:
 
 
 def _apparent_modulus(study: Study, gel: str) -> tuple[float, float] | None:
-    """Correlation of ln G of the neo-Hookean fits with the true ln Gα/R₀, and its std; None where either is missing."""
+    """Correlation of ln G of the neo-Hookean law with that of the true G α / R₀, and its std; needs the truth and fits
+    of that law.
+    """
     true = {name: study.true_values(gel, name) for name in ("G", "alpha", "R0")}
     if "nh" not in study.fits[gel] or len(true["G"]) < 3:
         return None

@@ -91,7 +91,10 @@ def simulate(
 
 
 def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> tuple[dict[str, Array], Array]:
-    """What is kept of N members at K times, and the record (N, …), in chunks: law tables alone are 32 kB per member."""
+    """Of N members at K times: what is kept of each by name, :data:`_FIELDS` (N, K), ``status`` and ``reason`` (N,),
+    and the solver's record (N, …). Chunk by chunk, each by all threads together; a chunk writes its rows and is
+    forgotten (law tables alone are 32 kB per member).
+    """
     n = len(x)
     workers = max(1, min(workers, n * model.system.size // _SHARE))
     chunk = _CHUNK * workers

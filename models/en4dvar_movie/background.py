@@ -98,7 +98,11 @@ class Background:
         return (image - np.float32(change)) * scale, np.where(tiles == 0, 0, (tiles - np.float32(change)) * scale)
 
     def _light(self, tiles: Array, white: bool) -> float:
-        """How much brighter than the level the background is by its brightest tiles, but for corners or a flash."""
+        """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble.
+
+        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle,
+        or makes the frame ``white``.
+        """
         apart = max(ALIKE * self.noise / TILE, CLOSE)
         alike = tiles > np.percentile(tiles, TOP) - apart
         change = float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
@@ -196,7 +200,9 @@ def pixel_noise(image: Frame, unit: float = 1.0) -> float:
 
 
 def _outside(frames: Sequence[Frame]) -> Mask:
-    """The outside of a field of view (H, W): dark in two corners at least, with an edge beside which only light is."""
+    """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, with
+    an edge that stands still, beside which are always light and no wall that moves.
+    """
     films = np.array(frames, dtype=np.float32)
     usual = ndimage.uniform_filter(np.median(films, axis=0), 5)
     bright = np.percentile(usual, FIELD)
@@ -222,7 +228,9 @@ def _outside(frames: Sequence[Frame]) -> Mask:
 
 
 def _burnt_in(frames: Sequence[Frame]) -> Mask:
-    """What is written into all frames (H, W), as a scale bar: white, sharper than by a lens, apart from the border."""
+    """What is written into all frames (H, W), such as a scale bar: white, and sharper than a lens shows anything, and
+    apart from the frame's border, from which overexposed needles and walls come.
+    """
     films = np.array(frames, dtype=np.float32)
     top = films.max()
     white: Mask = films.min(axis=0) > WHITE * top
@@ -286,7 +294,9 @@ def _one_way(frames: Sequence[Frame], changes: Sequence[Frame], box: tuple[slice
 
 
 def _begins_with_a_bubble(first: Frame, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
-    """True if the first frame has edges, a shade at its border or patches with rims that most frames lack."""
+    """True if the first frame has edges, or a shade over most of its border, that most frames lack; or if it differs
+    from a smooth surface in large patches whose rims other frames show elsewhere.
+    """
     lit = [_lit_as(frame.astype(np.float32), first) for frame in samples]
     changed = np.array([_changed(frame, first, noise) & ~blind for frame in lit])
     border = ~blind & ~ndimage.binary_erosion(np.ones_like(blind), iterations=BESIDE)
@@ -310,7 +320,9 @@ def _begins_with_a_bubble(first: Frame, samples: Sequence[Frame], noise: float, 
 
 
 def _edges_of_first(first: Frame, frame: Frame, changed: Mask, noise: float) -> float | None:
-    """The share of the edges about what changed in a frame (H, W) that the first one shows; None of small changes."""
+    """The share of the edges about what changed in a frame (H, W) that the first frame shows, 1/2 of a disc that shrank
+    a little; None where nothing large changed. In logarithms: a shade that falls on structure adds none of it.
+    """
     labels, sizes = labelled(changed)
     large = np.isin(labels, np.flatnonzero(sizes > max(BLOB, 2e-4 * first.size)))
     inner = ndimage.binary_erosion(large, iterations=BESIDE, border_value=1)
@@ -351,7 +363,9 @@ def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
 def _with_sign(
     level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: Mask, unit: float
 ) -> Background:
-    """Dark on bright, relative to the background, or bright on dark, as it is: by what differs most in most frames."""
+    """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames, of
+    which what is bright within what is dark is a bubble's middle.
+    """
     votes = []
     for frame in samples:
         off = np.where(blind, np.float32(0), _lit_as(frame, level) - level)
@@ -377,8 +391,10 @@ def _with_sign(
 
 
 def _refined(background: Background, samples: Sequence[Frame]) -> Background:
-    """With parts of later frames outside the bubble, and the mean of a square that scatters no more than its noise does
-    (Lee's filter, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165, 1980): all frames of a bubble at rest would share it.
+    """The background's level with the parts of later frames that lie outside the bubble: less noise.
+
+    What is left of it, all frames of a bubble at rest would share: where a square of the level scatters no more than
+    its noise does, it is its mean (Lee's filter, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165, 1980).
     """
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)

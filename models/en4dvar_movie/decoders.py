@@ -99,7 +99,10 @@ def tiff_frames(path: Path) -> Iterator[Any]:
 
 
 def _pages(file: Any, path: Path) -> Indices:
-    """The pages (frames, colours) of frames, by their axes. Raises :class:`DataError`: slices, or too many channels."""
+    """The pages (frames, colours) of each frame, by the axes that ImageJ, OME or tifffile has written.
+
+    Raises :class:`DataError` where a frame has slices in depth, or more channels than colours.
+    """
     series = file.series[0] if file.is_imagej or file.is_ome or file.is_shaped else None
     sizes = dict(zip(series.axes, series.shape, strict=True)) if series else {}
     sizes = {axis: n for axis, n in sizes.items() if axis not in "YXS" and n > 1}

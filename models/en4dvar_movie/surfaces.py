@@ -59,8 +59,10 @@ def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> t
 
 
 def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
-    """What stands still (H, W) and comes from the border: patches, no discs, that differ in nearly every frame, beside
-    a rim where nothing does. ``extremes`` (3, H, W): what differs usually, and most in a few frames to both sides.
+    """What stands still (H, W) and comes from the border: patches that differ in nearly every frame, beside a rim of
+    which nothing differs in more than a few, and which are no disc. Where they are wider than there, a bubble is.
+
+    ``extremes`` (3, H, W): what differs usually, and most in a few frames to both sides.
     """
     low, usual, high = extremes
     most = float(np.max(np.percentile(np.abs(extremes[:, field]), 99, axis=1)))
@@ -88,7 +90,9 @@ def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
 
 
 def _core(patch: Mask, by_still: Mask, ever: Mask, depth: Array) -> Mask:
-    """What a bubble always covers (H, W) of a patch that stands still and reaches into it: a disc about its middle."""
+    """What a bubble always covers (H, W) of a patch that stands still and reaches into it: a disc about the middle of
+    what it ``ever`` does, if that is wider than what stands still is at the border, by its ``depth`` there, which the
+    bubble may reach too. Its rim is seen on the side away from where the patch is ``by_still``."""
     labels, _ = labelled(ever)
     room = ndimage.distance_transform_edt(labels == np.max(labels[patch]))
     y, x = np.unravel_index(np.argmax(room), room.shape)
@@ -139,7 +143,9 @@ def _far(off: Array, unit: float) -> float:
 
 
 def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
-    """The shares of images (K, H, W) that differ and lie in discs through the rims of it, and that are in one alone."""
+    """Of images (K, H, W): the share that differs and lies in discs through the rims of what differs, and the share
+    that is in either but not in both. What has no rim, as a bubble that fills the field, tells nothing.
+    """
     smooth = np.abs(ndimage.uniform_filter(differences, (0, MEAN, MEAN)))
     most = float(np.max(np.percentile(smooth[:, field], 99, axis=1)))
     y, x = np.ogrid[: field.shape[0], : field.shape[1]]

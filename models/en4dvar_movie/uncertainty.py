@@ -98,7 +98,8 @@ def _unseen(known: Sequence[Outline], lasting: float) -> Array:
 
 
 def _beyond(squares: Array, noise: Array) -> Array:
-    """What squares (K,) hold beside noise of this mean and std, together with neighbours where it is not seen alone."""
+    """What squares (K,) hold beside their noise, of this mean and std: of neighbours together where it is not seen in
+    their own."""
     excess, bar, weights = squares - noise, (SIGNIFICANT**2 / 2 - 1) * noise, 1 / noise**2
     beyond = np.where(excess > bar, excess, 0.0)
     for n in np.flatnonzero(excess <= bar):
@@ -181,7 +182,9 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
 
 
 def _hidden(outlines: Sequence[Outline], ratios: Array) -> tuple[Array, float]:
-    """For the line of sight: the variance of radii (K,) by mode 2 beside that of all frames; the latter over R."""
+    """For the extent along the line of sight: the variance of each radius (K,), by what its own mode 2 or that of its
+    neighbours has beside the one that all frames share, and the amplitude over R of the latter.
+    """
     where = [k for k, o in enumerate(outlines) if o.amplitude(2) >= 0 and o.mode_std > 0]
     known, hidden = [outlines[k] for k in where], np.zeros(len(outlines))
     if not known:
@@ -196,8 +199,9 @@ def _hidden(outlines: Sequence[Outline], ratios: Array) -> tuple[Array, float]:
 
 
 def _lasting(shape: npt.NDArray[np.complex128], noise: Array) -> tuple[complex, float]:
-    """The mode 2 (A + iB over R) that frames share and its amplitude, of ``shape`` (K,) with variances ``noise`` (K,);
-    0 where it does not stand out of their scatter.
+    """The mode 2 (A + iB over R) that frames share and its amplitude; 0 where it does not stand out of their scatter.
+
+    ``shape`` (K,) with the variances ``noise`` (K,) of a frame's own.
     """
     shares = 1 / noise / np.sum(1 / noise)
     mean = complex(shares @ shape)
