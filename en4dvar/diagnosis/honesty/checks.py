@@ -353,7 +353,7 @@ def down_weighted(analysis: Analysis) -> Findings:
     more = f" and {len(worst) - MOST_LISTED} more" if len(worst) > MOST_LISTED else ""
     words = (
         f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations and "
-        f"were down-weighted (Huber): at {listed}{more} {CLOCK}"
+        f"were down-weighted: at {listed}{more} {CLOCK}"
     )
     yield caution("down-weighted", words)
 
