@@ -242,6 +242,8 @@ class OfScheme(Section):
                 kind = cls.kinds.get(name, Scheme) if isinstance(name, str) and not known else Scheme
                 cls._require_free(kind, section)
                 require_usable(str(name))
+                if isinstance(name, str) and ":" in name and name not in cls.kinds:
+                    raise ConfigError(f"{shown(name)} is no scheme; one of your own is named as ./file.py:Class")
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):

@@ -18,7 +18,7 @@ from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, g
 from en4dvar.model.state import Array, Field, Indices, floats
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.user_code import ReturnedError, line_of, own_fault, reason_of
+from en4dvar.plumbing.user_code import ReturnedError, line_of, loss_of, own_fault
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
 
@@ -69,7 +69,7 @@ class InitialStates:
             try:
                 states.append(self._build(physical[i : i + 1], cells[i : i + 1]))
             except BaseException as error:  # a model may refuse parameters in any way; the reason is kept
-                failures[i] = reason_of(error)
+                failures[i] = loss_of(error)
         return _without(failures), np.concatenate([np.empty((0, self.size)), *states]), failures
 
     def _build(self, physical: Array, cells: Array) -> Array:
@@ -169,7 +169,7 @@ class Reading:
             try:
                 predictions = self._all([outcome])
             except BaseException as error:  # H belongs to the user as well
-                reasons[i] = reason_of(error)
+                reasons[i] = loss_of(error)
                 continue
             if not np.isfinite(predictions[0]).all():
                 reasons[i] = NOT_FINITE

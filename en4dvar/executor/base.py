@@ -21,7 +21,7 @@ from en4dvar.model.forward import Batch, Failure, ForwardModel, Trajectory
 from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
 from en4dvar.plumbing.errors import En4dvarError
-from en4dvar.plumbing.user_code import describe, own_fault, reason_of
+from en4dvar.plumbing.user_code import describe, loss_of, own_fault, reason_of
 
 T = TypeVar("T")
 Outcome = Trajectory | Failure
@@ -76,7 +76,7 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         except TimeLimitError as error:
             reason = describe(error)
         except BaseException as error:  # a model may fail in any way; the reason is kept
-            reason = reason_of(error)
+            reason = loss_of(error)
         if len(x) <= model.batch:
             return [Failure(reason)] * len(x)
     times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))

@@ -18,7 +18,8 @@ import numpy.typing as npt
 from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout, floats
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import ConfigError, retold
-from en4dvar.plumbing.user_code import ReturnedError, reason_of
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.user_code import ReturnedError, loss_of
 
 
 def instants_of(times: npt.ArrayLike, unit: str) -> Array:
@@ -211,8 +212,13 @@ def read_along(read: Callable[[Any], Any], what: str, of_field: bool | None, pat
 
     Raises :class:`ReturnedError` where it gives something else; what ``read`` itself raises goes through.
     """
-    raw, asked = read(path), np.shape(path.times)
-    who = f"{what} ({getattr(read, '__qualname__', f'{type(read).__name__}.__call__')}): "
+    asked, who = np.shape(path.times), f"{what} ({getattr(read, '__qualname__', f'{type(read).__name__}.__call__')}): "
+    try:
+        raw = read(path)
+    except KeyError as error:
+        if (name := str(error.args[0])) in path.layout.names:
+            raise
+        raise ReturnedError(f"{who}{name!r} is not in the layout{suggest(name, path.layout.names)}") from error
     with retold((TypeError, ValueError), ReturnedError, who):
         values = floats(raw)
     axes = (0, 1) if of_field is None else (int(of_field),)
@@ -403,7 +409,7 @@ class ForwardModel(ABC):
                 try:
                     x = floats(self.step(x, t, float(t_next)), "step")
                 except BaseException as error:  # a model may fail in any way; the reason is kept
-                    return Failure(reason_of(error), t)
+                    return Failure(loss_of(error), t)
                 t = float(t_next)
             if x.shape != (self.layout.size,):
                 return Failure(f"step returned shape {x.shape}, expected ({self.layout.size},)", t)

@@ -15,7 +15,7 @@ import numpy as np
 
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array, Field, Parameter, StateLayout, floats
-from en4dvar.plumbing.user_code import reason_of
+from en4dvar.plumbing.user_code import loss_of
 
 Function = Callable[[dict[str, Any], Array], Any]
 
@@ -90,7 +90,7 @@ class FunctionModel(ForwardModel):
         try:
             states = self._states(self.function(self._named(theta), times.copy()), times.shape)
         except BaseException as error:  # a function may fail in any way; the reason is kept
-            return Failure(reason_of(error))
+            return Failure(loss_of(error))
         return Trajectory(times, states, self._path)
 
     def _run_many(self, theta: Array, times: Array) -> list[Trajectory]:

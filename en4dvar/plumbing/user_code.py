@@ -7,6 +7,7 @@ the process to itself: the working directory, warnings, numpy's errors, what Ctr
 
 import hashlib
 import os
+import re
 import signal
 import sysconfig
 import threading
@@ -28,6 +29,7 @@ from en4dvar.plumbing.files import here, read_plain
 Permission = Callable[["Code"], None]
 _permission: ContextVar[Permission | None] = ContextVar("permission", default=None)
 LONGEST = 100_000_000  # bytes of a file of code
+MISTAKES = (AttributeError, ImportError, LookupError, NameError, TypeError)  # of the author, not of a state
 _in_worker = False
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), sysconfig.get_path("stdlib"))
 
@@ -73,6 +75,12 @@ def reason_of(error: BaseException) -> str:
     """:func:`describe` of :func:`own_fault`: the reason why a member is lost."""
     fault = own_fault(error)
     return str(fault) if isinstance(fault, EndedError | ReturnedError) else describe(fault)
+
+
+def loss_of(error: BaseException) -> str:
+    """:func:`reason_of`, and of a mistake in the code its line, without the folder: records of moved files agree."""
+    where = line_of(error) if isinstance(error, MISTAKES) else ""
+    return reason_of(error) + re.sub(r"\(.*[/\\]", "(", where)
 
 
 def in_worker() -> None:

@@ -105,7 +105,7 @@ def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
         (lambda path: "high", "y (<lambda>): could not convert string to float: 'high'"),
         (lambda path: np.log(-1 - path["y"] ** 2), "RuntimeWarning: invalid value encountered in log"),
         (lambda path: path["y"] * np.nan, "non-finite prediction"),
-        (lambda path: path["z"], "KeyError: 'z'"),
+        (lambda path: path["z"], "y (<lambda>): 'z' is not in the layout; known: y, v, theta"),
     ],
 )
 def test_observation_operator_that_fails_is_a_failure(operator, reason):
@@ -141,6 +141,13 @@ def test_complex_states_are_told_and_not_cut_to_their_real_parts(method, monkeyp
     monkeypatch.setattr(Linear, method, lambda self, *asked: np.full(4, 1j))
     (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
     assert f"{method}: complex numbers; give real ones" in reason
+
+
+def test_a_mistake_in_the_code_is_told_with_its_line_and_a_failure_of_the_numbers_without():
+    problem = make_problem(Linear(("a", "b")), [1.0, 1.0])
+    problem = replace(problem, observable=Observable("y", "m", lambda path: path.z))
+    (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
+    assert re.fullmatch(r"AttributeError: 'Trajectory' object has no attribute 'z' \(test_failures\.py:\d+\)", reason)
 
 
 def test_an_initial_state_of_a_wrong_shape_is_told_with_both_shapes(monkeypatch):

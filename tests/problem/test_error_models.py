@@ -263,7 +263,7 @@ def test_an_outlier_leaves_the_robust_posterior_where_it_was():
     assert robust.down_weights[3] < 0.1
     assert gaussian.down_weights is None
     (words,) = [w for w in robust.warnings if "down-weighted" in w]
-    assert f"{plain.observations.times[3]:.4g} s (weight 0.0" in words.partition("(Huber): ")[2][:25]
+    assert f"{plain.observations.times[3]:.4g} s (weight 0.0" in words.partition("down-weighted: at ")[2][:25]
 
 
 def test_robust_posterior_against_quadrature():

@@ -81,13 +81,14 @@ def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
     text = (tmp_path / "own.yaml").read_text()
     (tmp_path / "negative.yaml").write_text(text.replace("patience: 4", "patience: -1"))
     (tmp_path / "other.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
-    for name in ("lost", "number", "twice"):
-        (tmp_path / f"{name}.yaml").write_text(text.replace("scheme: patient", f"scheme: {name}"))
-    asked = [f"{name}.yaml" for name in ("negative", "other", "lost", "number", "twice")]
+    for name, scheme in {"lost": "lost", "number": "number", "twice": "twice", "module": "patient:Patient"}.items():
+        (tmp_path / f"{name}.yaml").write_text(text.replace("scheme: patient", f"scheme: {scheme}"))
+    asked = [f"{name}.yaml" for name in ("negative", "other", "lost", "number", "twice", "module")]
     refused = called("-c", REFUSED, *asked, environment=package, folder=tmp_path)
-    negative, other, lost, number, twice = refused.stdout.split("---\n")
+    negative, other, lost, number, twice, module = refused.stdout.split("---\n")
     assert "assimilation.scheme: scheme 'lost' (nowhere:Lost) cannot be loaded: No module named 'nowhere'" in lost
     assert "assimilation.scheme: 'number' is not a subclass of en4dvar.schemes.Scheme" in number
+    assert "assimilation.scheme: 'patient:Patient' is no scheme; one of your own is named as ./file.py:Class" in module
     assert "'twice' is declared in en4dvar.schemes by again (patient:Other) and patient (patient:Patient);" in twice
     assert negative.startswith("2 ")
     assert "assimilation.patience" in negative

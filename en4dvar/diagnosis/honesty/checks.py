@@ -351,7 +351,7 @@ def down_weighted(analysis: Analysis) -> Findings:
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
     where = listed((f"{moment[k]} (weight {weights[k]:.2g})" for k in worst), MOST_LISTED)
     beyond = f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations"
-    yield caution("down-weighted", f"{beyond} and were down-weighted (Huber): at {where} {CLOCK}")
+    yield caution("down-weighted", f"{beyond} and were down-weighted: at {where} {CLOCK}")
 
 
 def weighted(analysis: Analysis) -> Findings:
