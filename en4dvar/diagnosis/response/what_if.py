@@ -172,7 +172,8 @@ def what_if(
     offered = [
         alternative
         for alternative in problem.alternatives
-        if alternative.values == 1.0 or not problem.has_reading_scale
+        if not (alternative.values != 1.0 and problem.has_reading_scale)
+        and not (alternative.times != 1.0 and problem.has_time_scale)
     ]
     shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
