@@ -8,7 +8,7 @@ from typing import Any
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part
 from en4dvar.model.forward import Alternative, ForwardModel, Observable
-from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, Parameter
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, TIME_SCALE, Parameter
 from en4dvar.plumbing.moved import former_name
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -51,11 +51,11 @@ class InverseProblem:
     """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
-    times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, one
-    named ``reading_scale`` the predictions, ``reading_offset`` is added to them, where the model has no parameter of
-    that name. ``discrepancy_amplitude``
-    and ``discrepancy_length`` are those of the discrepancy that the observations allow for. ``perturbations`` act on
-    the initial state, ``tied`` follow what is estimated. ``fixed`` are physical SI values of the other parameters.
+    times: member i is observed at t_k + t_s,i. One named ``time_scale`` multiplies t_k, ``sigma`` the std of every
+    observation error, ``reading_scale`` the predictions, to which ``reading_offset`` is added, where the model has no
+    parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the discrepancy that the
+    observations allow for. ``perturbations`` act on the initial state, ``tied`` follow what is estimated. ``fixed`` are
+    physical SI values of the other parameters.
     ``fields`` of the initial state are estimated cell by cell: a control vector then goes on with their cells, and the
     scheme has to be localised.
 
@@ -93,6 +93,11 @@ class InverseProblem:
     def has_noise_scale(self) -> bool:
         """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
         return self._has(NOISE_SCALE)
+
+    @property
+    def has_time_scale(self) -> bool:
+        """Whether ``time_scale`` is given and scales the observation times (rather than being the model's own)."""
+        return self._has(TIME_SCALE)
 
     @property
     def has_reading_scale(self) -> bool:

@@ -14,6 +14,7 @@ from en4dvar.model.state import (
     OF_READINGS,
     READING_OFFSET,
     READING_SCALE,
+    TIME_SCALE,
     TIME_SHIFT,
     Array,
     Indices,
@@ -159,18 +160,18 @@ class Composite:
     def run(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
 
-        Member i is observed at t_k + t_s,i, see :func:`as_read`. ``extra_times`` (M,), on the clock of the
-        observations, are read from the same run. A member fails, without disturbing the others, where a parameter
-        leaves its bounds, ``initial_state`` raises, the model returns a :class:`Failure`, or H gives anything but
-        finite numbers.
+        Member i is observed at a_i t_k + t_s,i, see :func:`clock_of` and :func:`as_read`. ``extra_times`` (M,), on the
+        clock of the observations, are read from the same run. A member fails, without disturbing the others, where a
+        parameter leaves its bounds, ``initial_state`` raises, the model returns a :class:`Failure`, or H gives anything
+        but finite numbers.
         """
         problem = self.problem
         times, reading, size, at_observations, at_extra, at_nodes = self._reading(extra_times)
         named = len(problem.prior.terms)
         physical = problem.prior.to_physical(x[:, :named])
         alive, states, failures = self._initial_states(physical, x[:, named:])
-        shift = of_framework(problem, physical, TIME_SHIFT, 0.0)
-        shifted = times + shift[alive, None]
+        scale, shift = clock_of(problem, physical)
+        shifted = scale[alive, None] * times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
         *read, reasons = reading.observe(outcomes, size)
         observed = np.full((len(reading.quantities), len(x), size), np.nan)
@@ -181,7 +182,7 @@ class Composite:
         observed = as_read(problem, physical, observed)
         rates = self._rates(observed, at_observations, at_nodes) if len(observed) > 1 else None
         predicted = with_errors(problem, physical, observed[0][:, at_observations], rates)
-        extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
+        extremes, beyond = limits[..., 0], (limits[..., 1] - shift[:, None]) / scale[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
     def _rates(self, observed: Array, at: Rows, nodes: Rows) -> Array:
@@ -298,13 +299,23 @@ def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ..
 
 
 def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
-    """Readings of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
+    """Readings of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``. Rates
+    are by the time of the data."""
+    if problem.has_time_scale:
+        observed = np.concatenate([observed[:1], observed[1:] * clock_of(problem, physical)[0][:, None]])
     if problem.has_reading_scale:
         observed = observed * of_framework(problem, physical, READING_SCALE, 1.0)[:, None]
     if problem.has_reading_offset:
         read = observed[0] + of_framework(problem, physical, READING_OFFSET, 0.0)[:, None]
         observed = np.concatenate([read[None], observed[1:]])
     return observed
+
+
+def clock_of(problem: InverseProblem, physical: Array) -> tuple[Array, Array]:
+    """Scale a and shift t_s (B,) of the times at which members are observed."""
+    own = not problem.has_time_scale
+    scale = np.ones(len(physical)) if own else of_framework(problem, physical, TIME_SCALE, 1.0)
+    return scale, of_framework(problem, physical, TIME_SHIFT, 0.0)
 
 
 def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:

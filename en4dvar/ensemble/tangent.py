@@ -13,7 +13,7 @@ import numpy as np
 from en4dvar.ensemble.forecast import Composite, Forecast
 from en4dvar.executor import Outcome, SerialExecutor
 from en4dvar.model.forward import Failure, ForwardModel, Trajectory
-from en4dvar.model.state import TIME_SHIFT, Array, floats
+from en4dvar.model.state import TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
@@ -62,12 +62,16 @@ def derivatives_of(problem: InverseProblem, linearisation: str) -> Derivatives |
     """
     if linearisation not in ("auto", "tangent"):
         return None
-    shifted = TIME_SHIFT.name in problem.prior.names
+    shifted = next((p.name for p in (TIME_SHIFT, TIME_SCALE) if p.name in problem.prior.names), "")
     if problem.model.differentiable and not shifted:
         return Derivatives(problem)
     if linearisation == "auto":
         return None
-    why = "t_s is estimated, which moves the readings along the path" if shifted else "the model gives no derivatives"
+    why = (
+        f"{shifted} is estimated, which moves the readings along the path"
+        if shifted
+        else "the model gives no derivatives"
+    )
     raise ConfigError(f"no tangent: {why}; leave this key out", KEY)
 
 

@@ -18,6 +18,7 @@ from en4dvar.diagnosis.response.what_if import Fit, LinearResponse, Shift, what_
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.localised import Localised
+from en4dvar.estimation.lost_frame import lost_frame
 from en4dvar.estimation.stages import Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
@@ -112,7 +113,10 @@ def _through(stages: Stages) -> Analysis:
         settled = agree or (sampled.refined is not None and not scattered)
         cautions += mode_cautions(prior, counting, analysis.modes, settled, sampled.refined)
     cautions += _missed_knots(stages, analysis)
-    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, tuple(cautions)))
+    told = partial(examine, analysis, control, outcome.descent.worst_loss)
+    doubts = told(tuple(cautions))
+    lost = lost_frame(stages, ends.mode, doubts)
+    analysis = replace(analysis, cautions=told((*cautions, *lost)) if lost else doubts)
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
         widened = with_shifts(ends.members, analysis.what_if, stages.seed)

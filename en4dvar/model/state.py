@@ -104,6 +104,14 @@ TIME_SHIFT = Parameter(
     display_unit="us",
     source="Spratt et al. (2021); the model is observed at t_k + t_s",
 )
+TIME_SCALE = _positive(
+    name="time_scale",
+    unit="1",
+    label="scale of the times",
+    symbol="$a$",
+    source="the model is observed at this factor times t_k, plus t_s; a model's own parameter goes before it",
+    common=True,
+)
 NOISE_SCALE = _positive(
     name="sigma",
     unit="1",
@@ -128,7 +136,7 @@ READING_OFFSET = Parameter(
     common=True,
 )
 # what any model may be given beside its own parameters
-OF_READINGS = TIME_SHIFT, NOISE_SCALE, READING_SCALE, READING_OFFSET
+OF_READINGS = TIME_SHIFT, TIME_SCALE, NOISE_SCALE, READING_SCALE, READING_OFFSET
 DISCREPANCY = (
     _positive(
         name="discrepancy_amplitude",

@@ -27,7 +27,7 @@ from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
 from en4dvar.inputs.parts import Column
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of, read_along
-from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, floats
+from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import listed
@@ -146,7 +146,8 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
     model = config.model
     shift, names = theta.get(TIME_SHIFT.name, 0.0), {p.name for p in model.parameters}
     read = {name: value for name, value in theta.items() if name not in names}
-    path = _path(model, {name: value for name, value in theta.items() if name in names}, times + shift)
+    times = read.get(TIME_SCALE.name, 1.0) * times + shift
+    path = _path(model, {name: value for name, value in theta.items() if name in names}, times)
     where = {series.name: _places(series, len(times)) for series in _series(config)}
     predictions = {}
     for name, observable in _observables(config).items():

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from estimation.test_lost_frame import problem as filmed
 from toys import Decay, Fragile, Toy, Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
 from varying_models import Ramp
 
@@ -151,6 +152,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "rank-deficient": lambda: run(many(8), members=6, sampling="random"),
     "future-missed": lambda: run(turned(10)),
     "missed-knots": lambda: run(ramp((2.6,))),
+    "lost-frame": lambda: run(filmed(1.0), members=12),
     "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
     "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
     "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),

@@ -24,6 +24,7 @@ from diagnosis.provoked import (
 )
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
+from estimation.test_lost_frame import problem as filmed
 from toys import Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
 
 from en4dvar.data.extrema import maxima
@@ -167,6 +168,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "implausible-data": linear,  # the units were wrong
     "future-missed": lambda: turned(20),
     "missed-knots": lambda: ramp((2.0,)),
+    "lost-frame": filmed,  # the times were corrected
     "model-validity": linear,  # a model without that limit
     "members-lost": narrow,
     "readings-missing": linear,  # a model that gives them

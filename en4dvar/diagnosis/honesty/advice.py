@@ -31,7 +31,7 @@ SIGMA = "estimate their size (parameters.sigma: {prior: lognormal, median: 1, lo
 @dataclass(frozen=True)
 class Case:
     """One warning of an analysis, and the ``codes`` of all that it has; ``exact``: one of them asks for smaller errors
-    of the times, so that no other may ask for larger ones without evidence."""
+    of the times, or for other times, so that no other may ask for larger ones."""
 
     a: Analysis
     caution: Caution
@@ -104,7 +104,7 @@ class Case:
     @property
     def timing(self) -> str:
         """How to state errors of the times where these explain the residuals better than what is stated; "" else."""
-        if not self.a.timing:
+        if self.exact or not self.a.timing:
             return ""
         model, stated = self.a.problem.model, float(np.median(self.a.observations.noise.time_std))
         larger, now = (
@@ -131,7 +131,8 @@ class Case:
 def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
     """The warnings with the advice of this configuration, where the catalogue's alone has been given."""
     codes = frozenset(c.code for c in cautions)
-    exact = any(c.code == "prior-conflict" and "data.error.time_std" in c.advice for c in cautions)
+    smaller = any(c.code == "prior-conflict" and "data.error.time_std" in c.advice for c in cautions)
+    exact = smaller or "lost-frame" in codes
     return tuple(
         replace(c, advice=ADVICE[c.code](Case(a, c, codes, exact)))
         if c.code in ADVICE and c.advice == CATALOGUE[c.code][1]

@@ -20,11 +20,11 @@ import numpy as np
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.diagnosis.response.what_if import LinearResponse
-from en4dvar.ensemble.forecast import of_framework
+from en4dvar.ensemble.forecast import clock_of, of_framework
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading, Readout, batched, operators_of
 from en4dvar.executor.base import without_warnings
 from en4dvar.model.forward import Failure, PathQuantity, Trajectory
-from en4dvar.model.state import READING_SCALE, TIME_SHIFT, Array
+from en4dvar.model.state import READING_SCALE, Array
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
 
@@ -91,9 +91,9 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     model, prior = problem.model, problem.prior
     physical = prior.to_physical(response.at)
     alive, start, _ = InitialStates(problem)(physical[None])
-    shift = float(of_framework(problem, physical[None], TIME_SHIFT, 0.0)[0])
+    (rate,), (shift,) = clock_of(problem, physical[None])
     scale = float(of_framework(problem, physical[None], READING_SCALE, 1.0)[0]) if problem.has_reading_scale else 1.0
-    times = problem.observations.times + shift
+    times = rate * problem.observations.times + shift
     path = None if alive is not EVERYONE else _path(problem, start, float(times.max()))
     if path is None:
         return None
@@ -103,7 +103,7 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     changes = [
         (model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)
     ]
-    local = _localised(problem, states[:-1], edges[:-1], shift, changes)
+    local = _localised(problem, states[:-1], edges[:-1], (rate, shift), changes)
     local = scale * local / (CHANGE * std[columns])[:, None, None]
     kernels = (gain @ _whitened(response, of) for gain, of in zip(response.gain[columns], local, strict=True))
     kernel = np.stack(list(kernels))
@@ -135,10 +135,11 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
 
 
 def _localised(
-    problem: InverseProblem, states: Array, start: Array, shift: float, changes: list[tuple[int, float]]
+    problem: InverseProblem, states: Array, start: Array, clock: tuple[float, float], changes: list[tuple[int, float]]
 ) -> Array:
     """The change of predictions (P, M, K) by each change (column of the state, value) within each cell. ``states`` (M,
-    n_state) of the path at ``start`` (M,) of each cell; readings are ``shift`` later than they say.
+    n_state) of the path at ``start`` (M,) of each cell; readings are made on a ``clock`` of that rate
+    and shift.
     """
     n_cells, variants = len(states), [states]
     for column, value in changes:
@@ -147,8 +148,9 @@ def _localised(
         variants.append(changed)
     x = np.concatenate(variants)
     begin = np.tile(start, len(variants))
-    times, (instants, rows) = problem.observations.times + shift, problem.observations.instants
-    outcomes = problem.model.resumed(x, begin, np.broadcast_to(instants + shift, (len(x), len(instants))))
+    (rate, shift), (instants, rows) = clock, problem.observations.instants
+    times = rate * problem.observations.times + shift
+    outcomes = problem.model.resumed(x, begin, np.broadcast_to(rate * instants + shift, (len(x), len(instants))))
     readout = Readout(operators_of(problem.parts), problem.parts, rows, slice(0, 0))
     read = Reading((readout,), (), batched(problem)).observe(outcomes, len(times))[0][0]
     runs = read.reshape(len(variants), n_cells, len(times))

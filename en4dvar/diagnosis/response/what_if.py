@@ -169,7 +169,12 @@ def what_if(
     """
     if not response.defined or not np.all(std > 0):
         return ()
-    offered = (of_it for of_it in problem.alternatives if of_it.values == 1.0 or not problem.has_reading_scale)
+    offered = [
+        alternative
+        for alternative in problem.alternatives
+        if not (alternative.values != 1.0 and problem.has_reading_scale)
+        and not (alternative.times != 1.0 and problem.has_time_scale)
+    ]
     shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 

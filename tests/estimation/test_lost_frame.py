@@ -1,0 +1,113 @@
+"""A frame that was lost, or counted twice: J of all times from some reading on moved, by a minimiser of scipy."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from toys import OBSERVABLE, Toy, make_observations
+
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.honesty.advice import advised
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import Trajectory
+from en4dvar.plumbing.caution import caution
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
+
+INTERVAL, STD, K, LOST = 0.25, 0.03, 18, 10
+MEAN, SPREAD = np.array([1.1, 1.4]), np.array([0.3, 0.2])  # of the prior
+SETTINGS = AssimilationSettings(members=12)
+
+
+class Tone(Toy):
+    """y = a cos(b t)."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        a, b = x[:, 2:3], x[:, 3:4]
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        states = np.stack([a * np.cos(b * own), -a * b * np.sin(b * own)], axis=-1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, np.concatenate([states, theta], -1), strict=True)]
+
+    def initial_state(self, theta):
+        return np.array([theta["a"], 0.0, theta["a"], theta["b"]])
+
+
+def problem(moved: float = 0.0, cheap: bool = True) -> InverseProblem:
+    """Readings of a = 1, b = 1.5; those from LOST on were made ``moved`` intervals later than their times say."""
+    model, times = Tone(compiled=cheap), INTERVAL * np.arange(1, K + 1)
+    made = times + moved * INTERVAL * (np.arange(K) >= LOST)
+    values = np.cos(1.5 * made) + STD * np.random.default_rng(4).standard_normal(K)
+    terms = map(PriorTerm.normal, model.parameters, MEAN, SPREAD)
+    return InverseProblem(model, OBSERVABLE, make_observations(times, values, STD), Prior(tuple(terms)))
+
+
+@cache
+def outcome(moved: float) -> Analysis:
+    return assimilate(problem(moved), SETTINGS, 1)
+
+
+def said(a: Analysis) -> list[str]:
+    return [c.words for c in a.cautions if c.code == "lost-frame"]
+
+
+def lowest(of: InverseProblem, by: float, k: int) -> float:
+    """J at its minimum where the times from reading k on are ``by`` later, from where the truth is."""
+    t, y = of.observations.times + by * (np.arange(K) >= k), of.observations.values
+
+    def residuals(x):
+        return np.concatenate([(y - x[0] * np.cos(x[1] * t)) / STD, (x - MEAN) / SPREAD])
+
+    return min(least_squares(residuals, start).cost for start in ([1.0, 1.5], [0.9, 1.6], [0.9, 1.4]))
+
+
+@pytest.mark.parametrize(
+    ("moved", "tried", "which"), [(1.0, 1.0, "early, as if a frame was lost"), (-1.0, -0.9, "late, as if")]
+)
+def test_the_reading_and_the_ratio_are_those_of_another_minimiser(moved, tried, which):
+    of = problem(moved)
+    costs = np.sort([lowest(of, tried * INTERVAL, k) for k in range(1, K)])[:2]
+    gains = (lowest(of, 0.0, K) - costs) / np.maximum(1, 2 * costs / K)
+    ratio = np.logaddexp.reduce(gains) - np.log(K - 1)
+    (words,) = said(outcome(moved))
+    assert f"after the reading at {LOST * INTERVAL:g} s, or one beside it, all times seem one interval" in words
+    assert f"(0.25 s) too {which}" in words
+    (told,) = re.findall(r"e\^([\d.]+) times likelier", words)
+    assert float(told) == pytest.approx(ratio, rel=0.01)
+
+
+def test_nothing_is_run_where_nothing_is_doubtful():
+    a, quiet = outcome(0.0), assimilate(problem(), replace(SETTINGS, what_if=False), 1)
+    assert not said(a)
+    assert a.forward_runs == quiet.forward_runs
+
+
+@pytest.mark.parametrize("why", ["what_if: false", "not cheap", "uneven", "another error"])
+def test_a_misfit_alone_is_no_lost_frame(why):
+    of = problem(0.0 if why == "another error" else 1.0, cheap=why != "not cheap")
+    o = of.observations
+    if why == "uneven":
+        times = o.times + 0.1 * INTERVAL * np.sin(7 * np.arange(K))
+        of = replace(of, observations=make_observations(times, o.values, STD))
+    if why == "another error":
+        of = replace(of, observations=make_observations(o.times, o.values + 0.2 * np.cos(4 * o.times), STD))
+    a = assimilate(of, replace(SETTINGS, what_if=why != "what_if: false"), 1)
+    assert {c.code for c in a.cautions} & {"misfit", "residual-structure"}
+    assert not said(a)
+
+
+@pytest.mark.parametrize("code", ["misfit", "odd-residuals", "discrepancy-found"])
+def test_no_larger_error_of_the_times_is_advised_beside_it(code):
+    a, other = (
+        replace(outcome(1.0), timing=0.1),
+        caution(code, "the residuals are larger where the observable changes fast"),
+    )
+    (alone,), (_, beside) = (advised(a, some) for some in ([other], [caution("lost-frame", "a frame"), other]))
+    assert "time_std" in alone.advice
+    assert "time_std" not in beside.advice
