@@ -115,7 +115,7 @@ def _through(stages: Stages) -> Analysis:
     cautions += _missed_knots(stages, analysis)
     told = partial(examine, analysis, control, outcome.descent.worst_loss)
     doubts = told(tuple(cautions))
-    lost = lost_frame(stages, ends.mode, doubts)
+    lost = lost_frame(stages, analysis, ends.mode, doubts)
     analysis = replace(analysis, cautions=told((*cautions, *lost)) if lost else doubts)
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data

@@ -20,6 +20,8 @@ from en4dvar.descent.loop import minimise
 from en4dvar.descent.start import ROUGH, descent_at
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.honesty.checks import THERE
 from en4dvar.estimation.stages import Stages
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution, codes
@@ -35,13 +37,14 @@ SMALL = 0.1  # of the prior's median amplitude, and of an interval between the t
 LIKELIER = 100.0
 
 
-def lost_frame(stages: Stages, mode: Array, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
+def lost_frame(stages: Stages, analysis: Analysis, mode: Array, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
     """A caution where the data speak for a frame that was lost, or counted twice. Nothing is run where nothing else is
-    doubtful, the times are not those of frames or the model is not cheap.
+    doubtful and a discrepancy is small, the times are not those of frames or the model is not cheap.
     """
     problem, scheme, o = stages.problem, stages.minimiser, stages.problem.observations
-    asked = stages.compares and stages.settings.what_if and problem.model.cheap and DOUBTS & set(codes(cautions))
-    if not (asked and scheme and scheme.searches and scheme.economical(stages.space.basis)):
+    asked = stages.compares and stages.settings.what_if and problem.model.cheap
+    doubtful = DOUBTS & set(codes(cautions)) or _discrepant(analysis)
+    if not (asked and doubtful and scheme and scheme.searches and scheme.economical(stages.space.basis)):
         return ()
     if o.parts or len(o) < FEWEST:
         return ()
@@ -61,6 +64,14 @@ def lost_frame(stages: Stages, mode: Array, cautions: Sequence[Caution]) -> tupl
             words = f"after the reading at {after}, or one beside it, all times seem one interval ({size}) too {seems}"
             said.append((log_ratio, f"{words}: without that the readings are e^{log_ratio:.1f} times likelier"))
     return (caution("lost-frame", max(said)[1]),) if said else ()
+
+
+def _discrepant(analysis: Analysis) -> bool:
+    """Whether half of the members have a discrepancy that, if more of them had it, would be warned of."""
+    sizes = [
+        analysis.posterior[:, j] for j, p in enumerate(analysis.parameters) if p in analysis.problem.discrepancy[:1]
+    ]
+    return any(np.nanmedian(size) > THERE * np.median(analysis.own_std) for size in sizes)
 
 
 def _costs(stages: Stages, mode: Array, by: float) -> dict[int, float]:

@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from toys import OBSERVABLE, Toy, make_observations
+from toys import OBSERVABLE, Toy, make_observations, with_discrepancy
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty.advice import advised
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.lost_frame import _discrepant
 from en4dvar.model.forward import Trajectory
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -86,6 +87,18 @@ def test_nothing_is_run_where_nothing_is_doubtful():
     a, quiet = outcome(0.0), assimilate(problem(), replace(SETTINGS, what_if=False), 1)
     assert not said(a)
     assert a.forward_runs == quiet.forward_runs
+
+
+def test_a_discrepancy_that_is_no_warning_yet_is_reason_enough_to_ask():
+    of = with_discrepancy(problem(), amplitude=(STD, 0.5), length=(1.0, 0.4))
+    a = assimilate(of, replace(SETTINGS, what_if=False, refine="none"), 1)
+    j, error = of.prior.names.index("discrepancy_amplitude"), np.median(a.own_std)
+    asked = []
+    for share in (0.2, 0.3):
+        posterior = a.posterior.copy()
+        posterior[:, j] = share * error
+        asked.append(_discrepant(replace(a, posterior=posterior)))
+    assert asked == [False, True]
 
 
 @pytest.mark.parametrize("why", ["what_if: false", "not cheap", "uneven", "another error"])
