@@ -152,6 +152,15 @@ def with_parameters(analysis, *parameters):
     return replace(analysis, problem=replace(analysis.problem, prior=Prior(terms)))
 
 
+def test_a_symbol_that_is_the_label_is_said_once(write_run, analysis):
+    first, *others = analysis.parameters
+    plain = with_parameters(analysis, replace(first, label="k", symbol="k"), *others)
+    html = write_pages(write_run(plain)).read_text(encoding="utf-8")
+    assert '<th scope="row"></th>' in html
+    assert '<th scope="row">K</th>' not in html
+    assert '<span class="quiet">k</span>' not in html
+
+
 @pytest.mark.slow
 def test_strings_of_data_and_configuration_are_escaped(write_run, analysis, renamed):
     evil = "<script>alert(1)</script>"
