@@ -9,7 +9,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -111,8 +111,10 @@ def _legends(figure: Figure, chart: Chart) -> None:
         drawn = [(next(axes), panel) for panel in row.panels if not panel.bare or panel.words]
         shown = [(ax, panel) for ax, panel in drawn if panel.legend]
         for ax, panel in shown:
-            entries = dict(reversed(list(zip(*reversed(ax.get_legend_handles_labels()), strict=True))))  # each once
-            labels, handles = list(entries)[::-1], list(entries.values())[::-1]
+            entries: dict[str, dict[type, Any]] = {}  # of a label, a mark of each kind, drawn over each other
+            for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+                entries.setdefault(label, {}).setdefault(type(handle), handle)
+            labels, handles = list(entries), cast(Any, [tuple(kinds.values()) for kinds in entries.values()])
             above = 1.0 + 0.12 * bool(panel.title)
             how: dict[str, Any] = {"columnspacing": 1.2, "handlelength": 1.4}
             if len(drawn) > 1 and len(shown) == 1 and row is chart.rows[0]:

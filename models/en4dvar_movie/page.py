@@ -23,6 +23,7 @@ SIDE = 240  # pixels of a picture, at most
 TURN = np.linspace(0, 2 * np.pi, 121)
 COLOURS = ("centre", "posterior", "background", "ink", "muted")  # of the modes of the shape
 DASHES = ("", "--", ":", "", "--")
+FELT = 5e-4  # of a radius: a tenth of what is taken for granted of a scale; less of a lasting shape is not told
 
 
 def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
@@ -40,7 +41,7 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
         background=track.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
-        factor=f"{100 * used[0].errors.factor:.2g}" if used and used[0].errors.factor else "",
+        factor=f"{100 * used[0].errors.factor:.2g}" if used and used[0].errors.factor > FELT else "",
         figures=[svg(draw(used, scale), name, name) for name, draw in (("radius", _radius), ("shape", _shape))],
         strip=_strip(movie, track),
         left_out=[r for r in track.readings if not r.used],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from movies import movie_of
 from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
+from en4dvar_movie.page import page_text
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.table import Scale, to_csv
 from en4dvar_movie.tracking import track
@@ -57,6 +59,15 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     (offset,) = (term for term in problem.prior.terms if term.parameter.name == "reading_offset")
     edge = 0.05 * np.sqrt(2 * np.pi) * 1.25  # px: 5 % of the contrast at the edge of this movie, 1.2 px and the pixel's
     np.testing.assert_allclose([offset.mean, offset.std], [0, 1e-6 * PIXEL * edge], atol=1e-8)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(2e-5, 0), (3e-3, 1)])
+def test_a_lasting_shape_is_on_the_page_where_it_is_felt(factor, words):
+    movie = movie_of(list(render(np.array([[20.0], [22.0]]), Scene(), np.random.default_rng(3))))
+    seen = track(movie)
+    readings = [replace(r, errors=replace(r.errors, factor=factor)) for r in seen.readings]
+    page = page_text(movie, replace(seen, readings=readings), Scale(2e-6, RATE), "en4dvar track")
+    assert page.count("A shape that lasts") == page.count("wrong by 0.3 %") == words
 
 
 @pytest.mark.slow

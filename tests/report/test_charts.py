@@ -64,6 +64,19 @@ def test_stacked_panels_have_one_axis_and_one_legend():
     assert len(on_paper(chart).axes[0].get_legend().get_texts()) == 2
 
 
+def test_an_entry_of_a_legend_on_paper_shows_each_kind_of_its_marks_once():
+    from matplotlib.lines import Line2D
+
+    panel, x = Panel(legend=True), np.arange(3.0)
+    for _ in range(2):
+        panel.bars(x, x, x + 1, "ink", 0.6, label="data ± std")
+        panel.dots(x, x, "ink", 2.2, label="data ± std")
+    (ax,) = on_paper(Chart([Row(90.0, [panel])], 200.0)).axes
+    legend = ax.get_legend()
+    assert len(legend.get_texts()) == 1
+    assert [line.get_marker() for line in legend.findobj(Line2D)] == ["None", "o"]
+
+
 @pytest.mark.parametrize("legends", [1, 3])
 def test_a_legend_leaves_its_panels_room(tmp_path, legends):
     """Matplotlib's layout warns, which is an error here, where a legend is wider than its panel."""

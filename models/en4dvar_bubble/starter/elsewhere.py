@@ -137,7 +137,7 @@ def scale_of(factor: float) -> Known:
     source = f"{SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
     wide = float(f"{math.hypot(SCALE.log_std, factor):.2g}")
     own = ", shared: none" * (factor > SCALE.log_std)  # the larger part is each bubble's own
-    return replace(SCALE, log_std=wide, source=source, shared=own) if factor else SCALE
+    return replace(SCALE, log_std=wide, source=source, shared=own) if wide > SCALE.log_std else SCALE
 
 
 def centred(model: BubbleModel, medium: str) -> BubbleModel:
