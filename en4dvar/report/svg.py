@@ -173,7 +173,7 @@ def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str]
             f'<g class="entry" data-label="{escape(label)}"><g fill="none">{drawn}</g>'
             f"{written(label, at + 14, line + SMALL + 1, 'start')}</g>"
         )
-        at += length + 5
+        at += length + 8
     return parts, line - top + SMALL + 6 if parts else 0.0
 
 

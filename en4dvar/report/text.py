@@ -84,12 +84,16 @@ def number_like(value: float, std: float) -> str:
 
     >>> number_like(2.80123, 0.104), number_like(-0.0, 0.1), number_like(float("nan"), 1.0)
     ('2.80', '0.00', '–')
+    >>> number_like(6.041e-9, 1.239e-10), number_like(1.239e-10, 1.239e-10)
+    ('6.04×10⁻⁹', '1.2×10⁻¹⁰')
     """
     places = max(0, 1 - math.floor(math.log10(std))) if std > 0 and math.isfinite(std) else 3  # two digits of the std
     if not math.isfinite(value):
         return "–"
     if places > 6 or max(abs(value), abs(std) if math.isfinite(std) else 0.0) >= 1e6:
-        return plain_number(value)
+        known = value != 0 and std > 0 and math.isfinite(std)
+        digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(std)) + 2 if known else 4
+        return plain_number(value, max(1, digits))
     text = f"{value:.{places}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
@@ -132,7 +136,7 @@ def signed(value: float) -> str:
 
 def percent(share: float) -> str:
     """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
-    return f"{100 * share:z.0f} %" if math.isfinite(share) else "–"
+    return f"{100 * share:z.0f} %".replace("-", "−") if math.isfinite(share) else "–"
 
 
 def fixed(value: float, places: int) -> str:

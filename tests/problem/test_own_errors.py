@@ -90,6 +90,8 @@ def test_its_mode_is_that_of_its_density():
         ({"_white": lambda s, stream, shape: stream.standard_normal(shape)}, "not 1; _white draws v from"),
         ({"_white": lambda s, stream, shape: stream.standard_normal(3)}, "drawn raises ValueError: operands"),
         ({"counts_within": math.inf}, "it says that its cost is quadratic, which it is not; counts_within is"),
+        ({"counts_within": lambda s: 1.0}, "it is a number, or a property that gives one"),
+        ({"scale_information": lambda s: 1.0}, "it is a number, or a property that gives one"),
         ({"scale_information": 2.0}, "scale_information is 2, by draws "),
         ({"words": 3}, "words is 3; it is a text"),
         ({"frozen": lambda s, at: None}, "frozen gives None; it gives a Noise"),

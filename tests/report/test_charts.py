@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
 
 from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, ticks
 from en4dvar.report.figures import steps
@@ -166,6 +168,16 @@ def test_legend_names_the_marks_it_switches():
     panel.band([0, 1], [0, 0], [1, 1], "posterior", 0.3, "90 % & more")
     text, _, _ = drawn(panel)
     assert text.count('data-label="90 % &amp; more"') == 2
+
+
+def test_capitals_of_a_legend_keep_away_from_the_next_mark():
+    panel = Panel(legend=True)
+    for label in ("RMSE", "spread"):
+        panel.line([0, 1], [0, 1], "posterior", label=label)
+    text, _, _ = drawn(panel)
+    first, second = (float(x) for x in re.findall(r'<text x="([\d.]+)"[^>]*>(?=RMSE|spread)', text))
+    wide = TextPath((0, 0), "RMSE", size=7, prop=FontProperties(family="DejaVu Sans")).get_extents().x1
+    assert second - 14 - (first + wide) > 4
 
 
 def test_paper_shows_the_same():

@@ -17,6 +17,7 @@ NAN = float("nan")
         (text.pretty_unit, ["um", "Pa s^0.6", "J/m^2", "1", "m s-1"], ["µm", "Pa·s^0.6", "J/m²", "", "m·s⁻¹"]),
         (text.rough_number, [287.4, 1.333, 6.18e6, NAN], ["290", "1.3", "6.2×10⁶", "–"]),
         (text.number_like, [(2.80123, 0.104), (-0.0, 0.1), (NAN, 1.0)], ["2.80", "0.00", "–"]),
+        (text.number_like, [(6.041e-9, 1.239e-10), (1.239e-10, 1.239e-10)], ["6.04×10⁻⁹", "1.2×10⁻¹⁰"]),
         (text.signed, [0.234, -4.0], ["+0.23", "−4"]),
         (text.fixed, [(-1.25, 1), (-0.01, 1), (NAN, 2)], ["-1.2", "0.0", "–"]),
         (text.symbol_html, [r"$\mu$", r"$R_{\mathrm{eq}}$", "<b>"], ["<i>μ</i>", "<i>R</i><sub>eq</sub>", "&lt;b&gt;"]),
@@ -48,7 +49,7 @@ def test_plus_minus(mean, std, shown):
 
 
 def test_no_minus_stands_before_a_rounded_zero():
-    assert (text.percent(-0.004), text.percent(-0.06), text.percent(float("nan"))) == ("0 %", "-6 %", "–")
+    assert (text.percent(-0.004), text.percent(-0.06), text.percent(float("nan"))) == ("0 %", "−6 %", "–")
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,10 @@ class _Trial:
     def __call__(self) -> None:
         if not isinstance(self.noise.words, str):
             raise ValueError(f"{self.who}: words is {shown(self.noise.words)}; it is a text")
+        for name in ("counts_within", "scale_information"):
+            number = self.called(name, lambda name=name: getattr(self.noise, name))
+            if not isinstance(number, int | float):
+                raise ValueError(f"{self.who}: {name} is {shown(number)}; it is a number, or a property that gives one")
         for method in ("influence", "_loss"):
             self.numbers(method, (2, len(self.v)), np.stack([self.v, -self.v]))
         frozen = self.called("frozen", lambda: self.noise.frozen(Predicted(self.m)))
