@@ -174,7 +174,7 @@ def propose(
         (*_model(law_name, model, look), *wall[:1]),
         lines,
         SIMPLER[chosen],
-        (*told, *[f"{len(views)} bubbles: {ends_with(groups.kind, sizes)}"] * bool(together)),
+        (*told, *[f"{len(views)} bubbles: {ends_with(groups.kind, sizes, looks)}"] * bool(together)),
         (*warnings, *unseen),
         together,
         _end(views, 3) if in_a_gel and np.median([v.n_minima for v in views]) > 2 else "",
