@@ -9,6 +9,7 @@ from en4dvar.config import Config
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
 from en4dvar.model.state import Parameter
+from en4dvar.plumbing.hints import rounded
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
@@ -85,14 +86,10 @@ def cost_summary(config: Config, preview: Preview, count: int) -> str:
     def span(words: Callable[[float], str], times: float) -> str:
         return " to ".join(dict.fromkeys(words(runs * times) for runs in (least, most)))
 
-    a_set, in_all = (" a data set", f"; in all {span(_digits, count)},") if count > 1 else ("", ":")
-    runs = f"about {span(_digits, 1)} forward runs{a_set}, {_seconds(preview.seconds)} each{in_all}"
+    a_set, in_all = (" a data set", f"; in all {span(rounded, count)},") if count > 1 else ("", ":")
+    runs = f"about {span(rounded, 1)} forward runs{a_set}, {_seconds(preview.seconds)} each{in_all}"
     took = f"{span(_seconds, count * preview.seconds)} on one thread"
     return f"cost: {runs} {took}, plus up to some seconds a data set for all else{more}"
-
-
-def _digits(count: float) -> str:
-    return f"{float(f'{count:.2g}'):.0f}"
 
 
 def _seconds(value: float) -> str:

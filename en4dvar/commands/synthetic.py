@@ -132,7 +132,7 @@ def design(source: Source, **how: Any) -> None:
 
     with continuable() as command, counted("designs") as on_design:
         plan, directory = run_design(
-            source.path, overrides=source.overrides(), on_design=on_design, command=command, **how
+            source.path, overrides=source.overrides(), on_design=on_design, on_cost=tell, command=command, **how
         )
     echo(design_table(plan))
     for remark in remarks(plan):

@@ -122,7 +122,7 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Finding]
             name = context["discriminator"].strip("'")
             yield _Finding((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
         elif kind == "extra_forbidden":
-            hint = suggest(place[-1], sorted(_keys_at(schema, place[:-1])))
+            hint = suggest(place[-1], _keys_at(schema, place[:-1]))
             yield _Finding(place, f"unknown key {shown(str(place[-1]))}{hint}", at_key=True)
         elif kind != "too_short" or len(item["input"]) < context["min_length"]:  # else of its parts some are at fault
             yield _Finding(place, _message(item), absent=kind == "missing", kind=bool(_KIND.fullmatch(kind)))
@@ -171,14 +171,17 @@ def _not_one_of(written: object, expected: str) -> str:
     return f"{shown(written)} is not {few}" + (hint if hint.startswith("; did") else "")
 
 
-def _keys_at(schema: type[BaseModel], place: Place) -> set[str]:
-    """Keys accepted at ``place``: fields (or aliases) of the models found by following the annotations."""
+def _keys_at(schema: type[BaseModel], place: Place) -> dict[str, str]:
+    """Keys accepted at ``place``, and what those mean whose annotation says it: fields (or aliases) of the models found
+    by following the annotations.
+    """
     models = [schema]
     for part in place:
         inner = [f.annotation for m in models for k, f in m.model_fields.items() if part in (k, f.alias)]
         if inner:
             models = [m for annotation in inner for m in _models_in(annotation)]
-    return {f.alias or k for m in models for k, f in m.model_fields.items()}
+    fields = {f.alias or k: f.metadata for m in models for k, f in m.model_fields.items()}
+    return {key: " ".join(words for words in fields[key] if isinstance(words, str)) for key in sorted(fields)}
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

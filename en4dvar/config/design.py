@@ -140,7 +140,8 @@ class Design(Section, SampleSizes):
     """Which law holds? Name → keys of this file and values, e.g. ``{model.law: ...}``; ``{}`` is the file itself."""
     method: Literal["auto", "linear", "laplace", "nested"] = "auto"
     """linear: at the prior mean; laplace: linearised over the prior; nested: simulated readings, each explained anew;
-    auto: laplace, checked by nested on the first and the best designs and replaced by it where they disagree."""
+    auto: laplace, checked by nested on the first and the best designs and replaced by it where they disagree; a check
+    costs a hundred times as many forward runs and ends once it is known to rest on too few effective draws."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:

@@ -47,6 +47,15 @@ def suggest(word: object, known: Iterable[str] | Mapping[str, object]) -> str:
     return f"; known: {', '.join(names)}" if names else ""
 
 
+def rounded(*counts: float) -> str:
+    """Counts to two digits, from the least to the most.
+
+    >>> rounded(2600), rounded(83140, 1923000), rounded(2601, 2602)
+    ('2600', '83000 to 1900000', '2600')
+    """
+    return " to ".join(dict.fromkeys(f"{float(f'{count:.2g}'):.0f}" for count in counts))
+
+
 def _meant(letters: str, known: Mapping[str, str]) -> list[str]:
     """The few names that begin with ``letters``, else those that hold them, else those whose meaning does."""
     if not 2 < len(letters) < LONGEST:

@@ -1,7 +1,7 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -21,13 +21,14 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.estimation.design.evaluate import Evaluated, Method, SampleSizes, evaluate
+from en4dvar.estimation.design.evaluate import Evaluated, Method, SampleSizes, evaluate, span_of_runs
 from en4dvar.estimation.design.nested import THIN
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
+from en4dvar.plumbing.hints import rounded
 from en4dvar.plumbing.units import UnitError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, digest
@@ -39,6 +40,7 @@ from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 STATE = f"{FOLDER}/designs"
 CHECKED = 3  # best designs whose linearised information is checked
 AGREE = 0.1  # nats
+CHEAP = "'--set design.method=laplace' leaves this out"
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,14 @@ def run_design(
     force: bool = False,
     resume: bool = False,
     on_design: Tell | None = None,
+    on_cost: Callable[[str], None] | None = None,
     command: str = "",
 ) -> tuple[Designs, Path]:
     """Evaluate the designs of a configuration. Returns what was found and the directory it lies in.
 
     ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next? Of a
     population what it says of its next data set.
-    ``on_design`` is called with how many designs are done, and of how many.
+    ``on_design`` is called with how many designs are done, and of how many; ``on_cost`` with what is said of the cost.
 
     Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
     :class:`OutputError`: the directory cannot.
@@ -98,7 +101,7 @@ def run_design(
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
-    return conduct_run(DesignKind(config, every, on_design), force, resume, command), config.directory
+    return conduct_run(DesignKind(config, every, on_design, on_cost), force, resume, command), config.directory
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,7 @@ class DesignKind(RunKind[Designs]):
     config: Config
     every: Sequence[Candidate]
     tell: Tell | None = None
+    tell_cost: Callable[[str], None] | None = None
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:
@@ -161,19 +165,46 @@ class DesignKind(RunKind[Designs]):
         estimate of few effective draws is no check: the linearised one stands and says so.
         """
         every, method = range(len(self.every)), self.config.design.method
+        auto: Method = "laplace" if method == "auto" else method
+        cost = f"cost: {self._cost(every, auto)}"
+        checks = min(len(every), 1 + CHECKED)
+        if method == "auto" and not self.config.design.laws:
+            cost += (
+                f"; then {self._cost(range(checks), 'nested')}, as a check, and of all if that finds them off; {CHEAP}"
+            )
+        self._say(kept, cost)
         if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
-            self._evaluate(kept, executor, every, "laplace" if method == "auto" else method)
+            self._evaluate(kept, executor, every, auto)
             return
         self._evaluate(kept, executor, every, "laplace")
         told = {d.number: d.results for d in kept.done if d.method == "laplace" and d.results}
         best = sorted(told, key=lambda number: -told[number][0].gain)[:CHECKED]
-        self._evaluate(kept, executor, [n for n in dict.fromkeys([0, *best]) if n in told], "nested")
-        both = (
-            pair for d in kept.done if d.method == "nested" for pair in zip(d.results, told[d.number], strict=False)
-        )
-        # a nested estimate of few effective draws is no check: the linearised one stands and says so
-        if any(abs(n.gain - o.gain) > AGREE + 2 * n.error for n, o in both if n.thin <= THIN):
+        checked = [n for n in dict.fromkeys([0, *best]) if n in told]
+        self._evaluate(kept, executor, checked, "nested")
+        off = {
+            d.number: n.gain - o.gain
+            for d in kept.done if d.method == "nested"
+            for n, o in zip(d.results, told[d.number], strict=False)
+            if n.thin <= THIN and abs(n.gain - o.gain) > AGREE + 2 * n.error
+        }  # fmt: skip
+        if off:
+            by = ", ".join(f"of design {number} by {-difference:+.2g} nats" for number, difference in off.items())
+            cost = self._cost([n for n in told if n not in checked], "nested")
+            self._say(kept, f"the linearised information is off, {by}; cost: {cost}; {CHEAP}")
             self._evaluate(kept, executor, list(told), "nested")
+
+    def _say(self, kept: KeptUnits[Done], words: str) -> None:
+        kept.log.write(words)
+        if self.tell_cost:
+            self.tell_cost(words)
+
+    def _cost(self, numbers: Sequence[int], method: Method) -> str:
+        """What it takes to evaluate so many designs, in words; they are taken to be as the first."""
+        design = self.config.design
+        planned = Planned(planned_problem(self.config), design.about, design.common)
+        runs = span_of_runs(planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
+        plural = "s" * (len(numbers) > 1)
+        return f"{len(numbers)} design{plural} by {method}, about {rounded(*runs)} forward runs each"
 
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
         done = {d.number for d in kept.done if d.method == method}
@@ -260,7 +291,7 @@ def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
     problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
     sizes, alike = design.part(SampleSizes), design.experiments
     choice = (design.choose.readings, design.choose.apart) if design.choose else None
-    told = design.common, _wanted(config, problem)
+    told = design.common, _wanted(config, problem), design.method == "auto"
     every = evaluate(problem, design.about, sizes, method, seed, alike, choice, laws, *told)
     costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
     broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
@@ -276,6 +307,8 @@ def _line(done: Done) -> str:
     of = " of the law" if result.decision else f" ({result.method})"
     worth = f"{result.worth:.4g} nats ± {result.worth_error:.2g}{of}"
     left = f"; {done.failure}" if done.failure else ""
+    if result.thin > THIN:
+        left = f"; {100 * result.thin:.0f} % of the simulated readings are explained by too few effective draws{left}"
     return f"design {done.number}: {worth}, {result.forward_runs} runs{left}"
 
 

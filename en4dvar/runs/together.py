@@ -22,10 +22,11 @@ from en4dvar.estimation.joint.problem import JointProblem, sharing
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population import campaign as of_campaign
 from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, population_of
+from en4dvar.estimation.population.own import expected_runs
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import listed, rounded
 from en4dvar.problem import InverseProblem
 from en4dvar.results import together as stored
 from en4dvar.results.checkpoint import FOLDER, Journal, KnownRuns, digest, file_digest, write_checkpoint
@@ -240,7 +241,10 @@ class PopulationKind(TogetherKind):
         self, sets: Sequence[Finished], config: Config, executor: Executor, attributes: Mapping[str, Any], path: Path,
         tell: Tell,
     ) -> None:  # fmt: skip
-        tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
+        drawn = sum(s.drawn is None for s in sets)
+        cost = f"; cost: about {rounded(*expected_runs(sets[0].problem))} forward runs each of {drawn}" * (drawn > 0)
+        less = f", {len(sets) - drawn} have kept their draws" * (drawn < len(sets))
+        tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets{cost}{less}")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
         asked = config.population.part(HyperPrior) if config.population else HyperPrior()
         hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))

@@ -144,6 +144,7 @@ class TestFaults:
             ("  constants: water\n", "model.constants", "'water' is not one of water-25C, imr-v1, imr-v2", 4),
             ("  constants: {set: imr-v22}\n", "model.constants.set", "did you mean 'imr-v2'?", 4),
             ("  constants: {rho: 998}\n", "model.constants.rho", "998 has no unit", 4),
+            ("  constants: {surface_tension: 0.05 N/m}\n", "model.constants.surface_tension", "did you mean 'S'?", 4),
             ("  constants: {sources: {roh: me}}\n", "model.constants.sources", "did you mean 'rho'?", 4),
             ("  medium: jelly\n", "model.medium", "'jelly' is not one of water, polyacrylamide", 4),
             ("  medium: {name: peg, concentration: 30 m}\n", "model.medium.concentration", "converted", 4),

@@ -13,6 +13,7 @@ from init_files import call, proposed, write
 from en4dvar.cli import main
 from en4dvar.inputs.implausible import outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import Layout, read_contents
+from en4dvar_bubble.starter.grouped import ends_with
 
 TIMES = np.arange(1, 84) * 1.6
 
@@ -219,3 +220,19 @@ def test_growth_and_collapse_alone_may_be_of_a_laser(tmp_path: Path) -> None:
     code, output = told(tmp_path, "".join(text.splitlines(keepends=True)[:29]))
     assert code == 0, output
     assert "give --start laser" in output
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["al_1", "al_2", "pa_1", "pa_2"], "names begin with al (2) or pa (2): if these are two gels, write a table "),
+        (["al_1", "pa_1", "pa_2", "pa_3"], ""),  # one of a kind is no gel
+        (["al_1", "al_2", "pa_1", "pa_2", "q_1", "q_2"], ""),
+        (["b1", "b2", "b3", "b4"], ""),
+    ],
+)
+def test_files_of_two_kinds_of_names_may_be_of_two_gels(names: list[str], told: str) -> None:
+    words = ends_with("folder", {}, names)
+    assert words.startswith("at its end the run estimates their one gel")
+    assert told in words
+    assert ("add --groups gels.csv" in words) == bool(told)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from toys import Vectorised
 
 import en4dvar
 from en4dvar.cli import main
+from en4dvar.estimation.design import nested
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
 from en4dvar.report.design import design_table, fans, front, needs, readings_text, remarks
@@ -166,6 +168,61 @@ def test_a_nested_estimate_of_few_effective_draws_is_no_check(tmp_path, monkeypa
     assert (one.method, one.thin) == ("laplace" if thin else "nested", thin)
     assert ("the linearised information, which stands" in told) == bool(thin)
     assert ("1 of these experiments (by nested) cannot tell more than 4 (by laplace)" in told) == (not thin)
+
+
+@pytest.mark.parametrize("enough", [1e9, 1.0])
+def test_a_check_that_is_of_no_use_is_given_up(tmp_path, monkeypatch, enough):
+    """Where too few draws are effective behind 3 of 20 simulated readings, the other 17 would cost more for nothing."""
+    monkeypatch.setattr(nested, "ENOUGH", enough)
+    monkeypatch.setattr(nested, "ROUNDS", 2)
+    explained, calls, told = nested.explained, [], []
+    monkeypatch.setattr(nested, "explained", lambda *args: calls.append(1) or explained(*args))
+    settings = {"execution.executor": "serial"}
+    found, folder = run_design(
+        _plan(knobs={}, about=["a"]), out=tmp_path / "out", overrides=settings, on_cost=told.append
+    )
+    assert len(calls) == 2 * (3 if enough > 1 else 20)
+    assert found.rows[0].result.thin == (1.0 if enough > 1 else 0.0)
+    assert told[0].startswith("cost: 1 design by laplace, about 60 forward runs each; then 1 design by nested, about ")
+    assert "as a check, and of all if that finds them off; '--set design.method=laplace' leaves this out" in told[0]
+    log = (folder / "run.log").read_text()
+    assert told[0] in log
+    assert ("100 % of the simulated readings are explained by too few effective draws" in log) == (enough > 1)
+
+
+@pytest.mark.parametrize(
+    ("method", "laws"),
+    [
+        ("linear", {}),
+        ("laplace", {}),
+        ("nested", {}),
+        pytest.param("nested", {"one": {}, "other": {"parameters.b.std": "2 m"}}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_runs_are_as_many_as_was_said(tmp_path, method, laws):
+    plan = _plan(knobs={}, about=["a"], laws=laws, method=method)
+    found, folder = run_design(plan, out=tmp_path / "out", overrides={"execution.executor": "serial"})
+    (said,) = (line for line in (folder / "run.log").read_text().splitlines() if "cost: 1 design by" in line)
+    least, _, most = re.search(r"about ([\d ]+)( to ([\d ]+))? forward runs each", said).groups()
+    least, most = (float(text.replace(" ", "")) for text in (least, most or least))
+    assert 0.95 * least <= found.rows[0].result.forward_runs <= 1.05 * most
+
+
+def test_linearised_information_that_is_off_is_told_before_all_is_evaluated_anew(tmp_path, monkeypatch):
+    """Five nats, of each of seven designs."""
+
+    def off(problem, about, sizes, method, *args):
+        every = evaluate(problem, about, sizes, "linear", *args)
+        return [replace(it, method=method, gain=it.gain + 5 * (method == "nested")) for it in every]
+
+    evaluate, told = design_run.evaluate, []
+    monkeypatch.setattr(design_run, "evaluate", off)
+    settings = {"execution.executor": "serial"}
+    found, _ = run_design(_plan(), out=tmp_path / "out", overrides=settings, on_cost=told.append)
+    assert {row.result.method for row in found.rows} == {"nested"}
+    assert re.search(
+        "^the linearised information is off, of design 0 by -5 nats, .*; cost: . designs by nested", told[1]
+    )
 
 
 def test_a_design_that_cannot_be_made(tmp_path):

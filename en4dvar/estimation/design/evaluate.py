@@ -22,7 +22,7 @@ import numpy as np
 from annotated_types import Ge
 
 from en4dvar.ensemble.forecast import plotting_times
-from en4dvar.estimation.design.nested import Decision, deciding, nested
+from en4dvar.estimation.design.nested import Decision, deciding, nested, span_of_rounds
 from en4dvar.estimation.design.planned import Planned, Tangents, expected, require_alive, shared_spread
 from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.plumbing.errors import ConfigError
@@ -89,6 +89,21 @@ class Evaluated:
         return self.decision.information_error if self.decision else self.error
 
 
+def span_of_runs(
+    planned: Planned, sizes: SampleSizes, method: Method, choice: bool = False, laws: int = 0
+) -> tuple[int, int]:
+    """Forward runs of :func:`evaluate`, about, at least and at most."""
+    n, simulated = len(planned.names), min(sizes.simulated, sizes.draws)
+    runs = sizes.draws + n + 1 if method == "linear" else sizes.draws * (n + 1)
+    runs += (choice * sizes.draws + laws * sizes.simulated) * (n + 1)
+    integrals = laws**2 * sizes.simulated
+    if method == "nested":
+        runs += simulated * (n + 1)
+        integrals += simulated * (1 if planned.asked == n else 2)
+    least, most = span_of_rounds(integrals)
+    return runs + least * sizes.inner, runs + most * sizes.inner
+
+
 def evaluate(
     problem: InverseProblem,
     about: Sequence[str],
@@ -100,6 +115,7 @@ def evaluate(
     laws: Sequence[InverseProblem] = (),
     common: Sequence[str] = (),
     wanted: Mapping[str, tuple[float, bool]] | None = None,
+    check: bool = False,
 ) -> tuple[Evaluated, ...]:
     """Evaluate a design, for every number of experiments ``alike``.
 
@@ -107,7 +123,8 @@ def evaluate(
     linearisation. ``laws``: the same experiment explained by each of several laws, read as ``problem`` is; which
     of them holds is asked as well. ``common``: parameters that experiments alike share beside those asked for.
     ``wanted``: name → std to which it is to be known, in its unit, or relative to the value where true; what the others
-    must be known to for it is found by linearisation.
+    must be known to for it is found by linearisation. ``check``: a nested estimate is ended as soon as it is known to
+    be rough.
 
     Raises ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model
     fails.
@@ -140,7 +157,7 @@ def evaluate(
         linearised = np.stack([std, relative])
         ratio = values.std.mean(axis=0)
         if method == "nested" and n == 1:
-            simulated = nested(planned, u[: sizes.simulated], sizes.inner, seed)
+            simulated = nested(planned, u[: sizes.simulated], sizes.inner, seed, check)
             more, its_error = simulated.correction
             gain, error, by = gain + more, float(np.hypot(error, its_error)), method
             thin = simulated.thin

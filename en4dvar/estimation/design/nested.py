@@ -70,8 +70,16 @@ class Nested(Gains):
         return float(difference.mean()), standard_error(difference)
 
 
-def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
+def span_of_rounds(integrals: int) -> tuple[int, int]:
+    """The rounds of runs of so many ``integrals`` of :func:`explained`, at least and at most."""
+    return 2 * integrals, (CLOSING + 3 * ROUNDS) * integrals
+
+
+def nested(planned: Planned, u: Array, inner: int, seed: int, check: bool = False) -> Nested:
     """From draws (R, n) of the prior, one simulated set of readings and ``inner`` runs (a round) each.
+
+    ``check``: an estimate that is rough is of no use, so that no further readings are explained once it is known to be
+    one. The cost of an integral that many effective draws never stand behind is the highest.
 
     Raises :class:`TooFewMembersError` where the model mostly fails.
     """
@@ -91,8 +99,13 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
         draws = explained(planned, y, truths.u[i, :0], near, inner, stream)
         log, of_all = log_integral(draws)
         plain[i], effective[i], spread[i] = known - log, min(of_known, of_all), _spread(planned, draws)
+        if check and np.sum(effective[: i + 1] < ENOUGH) > THIN * len(values):
+            count = i + 1
+            truths, values = truths.some(range(count)), values[:count]
+            plain, effective, spread = plain[:count], effective[:count], spread[:count]
+            break
     alive = np.isfinite(plain)
-    require_alive(int(alive.sum()), len(u))
+    require_alive(int(alive.sum()), len(values))
     innovations, (_, rows) = truths.whitened(planned, values)[0], truths.whitened(planned)
     gains = plain - control_variate(innovations, rows, truths.u, planned.asked)
     linearised = 0.5 * np.linalg.slogdet(about(precision(rows), planned.asked))[1]

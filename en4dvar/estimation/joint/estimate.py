@@ -23,12 +23,13 @@ from en4dvar.estimation.joint.agreement import (
     oddest,
 )  # fmt: skip
 from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled
-from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
+from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled, span_of_runs
 from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
+from en4dvar.plumbing.hints import rounded
 from en4dvar.priors.prior import own_seed
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.settings import AssimilationSettings
@@ -133,7 +134,11 @@ class _Estimate:
 
     def result(self, singles: Sequence[Single], most: int | None = None) -> JointEstimate:
         """Of which at ``most`` so many experiments are left out as odd."""
-        joint, experiments, singles = self.joint, self.experiments, singles or self._singles()
+        joint, experiments = self.joint, self.experiments
+        if self.samples:
+            runs = f"{rounded(*span_of_runs(len(experiments)))} forward runs, beside some thousands of the search"
+            self.tell(f"cost: members of {len(experiments)} data sets are drawn by about {runs}")
+        singles = singles or self._singles()
         descents = self._descents(self._starts(singles))
         lowest = self._challenged(min(descents, key=lambda descent: descent.at.cost))
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
@@ -262,9 +267,14 @@ class _Estimate:
             lowest = lower[0]
         return lowest
 
+    @property
+    def samples(self) -> bool:
+        """Whether members are drawn by importance."""
+        return self.settings.refine != "none" and all(problem.model.cheap for problem in self.joint.experiments)
+
     def _members(self, lowest: JointDescent) -> tuple[JointMembers, list[Caution]]:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
-        if self.settings.refine == "none" or not all(problem.model.cheap for problem in self.joint.experiments):
+        if not self.samples:
             return laplace, []
         members = sampled(self.experiments, lowest.at, self.seed, self.settings.members, self.tell)
         if members is not None:

@@ -65,6 +65,11 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
     return JointMembers(at.place.border + x, own_members, np.nan, evidence)
 
 
+def span_of_runs(count: int) -> tuple[int, int]:
+    """Forward runs of :func:`sampled`, of so many experiments, at least and at most."""
+    return count * LEAST * DRAWS * INNER, count * ROUNDS * DRAWS * INNER
+
+
 def sampled(
     experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int,
     tell: Callable[[str], None] = lambda words: None,

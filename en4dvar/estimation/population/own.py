@@ -44,7 +44,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling.emulated_cost import RIDGE, Coordinates, Emulator
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
 from en4dvar.sampling.mixture import StudentMixture, fit_gaussians
-from en4dvar.sampling.modes import sample_modes
+from en4dvar.sampling.modes import LAST_RUNS, sample_modes, typical_runs
 
 ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
@@ -196,6 +196,11 @@ class OwnLikelihood:
     half: Mixture
     following: Following
     adjusted: Array
+
+
+def expected_runs(problem: InverseProblem) -> tuple[int, int]:
+    """Forward runs of :func:`own_draws`: typically, and where too few draws become effective."""
+    return typical_runs(len(problem.prior.names), ENOUGH), math.ceil(LAST_RUNS * ENOUGH)
 
 
 def own_draws(

@@ -4,7 +4,8 @@ import glob
 import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from en4dvar.plumbing.units import is_unit
 FOLDER = "folder"
 _UNIT = re.compile(r"(.+?)[ _]*[\[(/ _] *([^\W\d_]+|%) *[\])]?")
 _NUMBER = re.compile(r"\d+([.,]\d+)?")
+_LETTERS = re.compile(r"[^\W\d_]*")
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,18 @@ class Together(NamedTuple):
     groups: Grouped
 
 
-def ends_with(kind: str, sizes: Mapping[str, int]) -> str:
-    """What the run estimates at its end of groups of a kind and their numbers of bubbles; of one gel without groups."""
+def ends_with(kind: str, sizes: Mapping[str, int], names: Iterable[str]) -> str:
+    """What the run estimates at its end of groups of a kind and their numbers of bubbles; of one gel without groups,
+    which data sets whose ``names`` begin in two ways may not be of.
+    """
     if not sizes:
-        return "at its end the run estimates their one gel"
+        count = Counter(_LETTERS.match(name)[0] for name in names)  # type: ignore[index]
+        begin = " or ".join(f"{letters} ({of_it})" for letters, of_it in count.items())
+        asked = (
+            f"; names begin with {begin}: if these are two gels, write a table gels.csv of two columns, file and gel, "
+            "with a line for each file, and add --groups gels.csv to this command"
+        )
+        return "at its end the run estimates their one gel" + asked * (len(count) == 2 and min(count.values()) > 1)
     told = ", ".join(f"{name} ({count})" for name, count in sizes.items())
     return f"at its end the run estimates each {kind}, and compares them: {told}"
 

@@ -18,6 +18,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar_bubble.collapse import conceivable, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
+from en4dvar_bubble.laws.shells import MarmottantShell
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
@@ -46,6 +47,7 @@ WHY = {
     "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
     "0.7": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
     "viscosity_change": "std of ln of its change after the window: viscosity is not all that damps the first collapses",
+    "rtol": "of a coating that buckles J is smoother then, and the search for its minimum converges",
     "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
 }
 # The quicker gas that a laser-induced bubble can be compared with; benchmarks/laser_gas.py has what it costs.
@@ -174,7 +176,7 @@ def propose(
         (*_model(law_name, model, look), *wall[:1]),
         lines,
         SIMPLER[chosen],
-        (*told, *[f"{len(views)} bubbles: {ends_with(groups.kind, sizes)}"] * bool(together)),
+        (*told, *[f"{len(views)} bubbles: {ends_with(groups.kind, sizes, looks)}"] * bool(together)),
         (*warnings, *unseen),
         together,
         _end(views, 3) if in_a_gel and np.median([v.n_minima for v in views]) > 2 else "",
@@ -388,6 +390,7 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
         Entry("law", law, "others: en4dvar laws"),
         Entry("start", start, look.reason if look else "or " + ("laser" if start == "acoustic" else "acoustic")),
         *(Entry(key, value, WHY[value]) for key, value in MODEL[start].items()),
+        *[Entry("rtol", "1e-8", WHY["rtol"])] * isinstance(model.law, MarmottantShell),
         *[Entry("viscosity_change", "1", WHY["viscosity_change"])] * _in_a_liquid(model),
     ]
     if start == "acoustic":
