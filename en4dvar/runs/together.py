@@ -242,7 +242,9 @@ class PopulationKind(TogetherKind):
         tell: Tell,
     ) -> None:  # fmt: skip
         drawn = sum(s.drawn is None for s in sets)
-        cost = f"; cost: about {rounded(*expected_runs(sets[0].problem))} forward runs each of {drawn}" * (drawn > 0)
+        cost = f"; cost: up to about {rounded(*expected_runs(sets[0].problem))} forward runs each of {drawn}" * (
+            drawn > 0
+        )
         less = f", {len(sets) - drawn} have kept their draws" * (drawn < len(sets))
         tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets{cost}{less}")
         problems, white = [s.problem for s in sets], [s.white for s in sets]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from en4dvar.runs.together import _cautions, population
 
 STD, SETS = 0.3, 6
 SMALL = Effort(hyper_walkers=32, draws=1500)
+TOLD: list[str] = []
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +52,14 @@ def found(campaign, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     with pytest.MonkeyPatch.context() as patch:  # fresh draws of an emulator say nothing more
         patch.setattr("en4dvar.estimation.population.own._emulated", lambda *of: None)
-        return population([campaign], ["k"], out, effort=SMALL)[0], out
+        return population([campaign], ["k"], out, effort=SMALL, tell=TOLD.append)[0], out
 
 
 def test_files_and_the_answer(found):
     stored, folder = found
     assert stored.names == ("k",)
+    said = re.search(r"behind 3 data sets; cost: up to about (\d+) to (\d+) forward runs each of 3$", TOLD[0])
+    assert int(said[1]) / 4 < stored.tree.attrs["forward_runs"] / 3 < int(said[2])
     posterior = stored.group("posterior")
     assert posterior["k_mean"].dims == ("chain", "draw")
     assert posterior["A"].dims == ("chain", "draw", "dataset")

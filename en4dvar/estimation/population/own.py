@@ -199,7 +199,7 @@ class OwnLikelihood:
 
 
 def expected_runs(problem: InverseProblem) -> tuple[int, int]:
-    """Forward runs of :func:`own_draws`: typically, and where too few draws become effective."""
+    """Most forward runs of :func:`own_draws`: where an emulator is good, and where few draws become effective."""
     return typical_runs(len(problem.prior.names), ENOUGH), math.ceil(LAST_RUNS * ENOUGH)
 
 
