@@ -4,6 +4,7 @@ A wrong ``influence``, norm or width would give a wrong posterior without a word
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class _Trial:
         if not isinstance(self.noise.words, str):
             raise ValueError(f"{self.who}: words is {shown(self.noise.words)}; it is a text")
         for name in ("counts_within", "scale_information"):
-            number = self.called(name, lambda name=name: getattr(self.noise, name))
+            number = self.called(name, partial(getattr, self.noise, name))
             if not isinstance(number, int | float):
                 raise ValueError(f"{self.who}: {name} is {shown(number)}; it is a number, or a property that gives one")
         for method in ("influence", "_loss"):
