@@ -126,7 +126,7 @@ def index_of(
             return index_of(times, values, instant.otherwise, first, prominence, last)
         if falls:
             level = f"{100 * instant.share:.3g} % of maximum"
-            elsewhere = f"end it elsewhere ('to: {level} or end', or at a time)"
+            elsewhere = f"give another instant or a time, or write '{level} or end'"
             raise DataError(f"asks for {level}, but no reading after the maximum is below that; {elsewhere}")
         few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
         elsewhere = f"'to: {instant.kind} {instant.number} or end', or at a time"

@@ -38,6 +38,8 @@ def require_no_other(folder: Path) -> None:
     if kind is kind_named("estimate"):
         return
     tables = [str(folder / name) for name in (*kind.files, *kind.pages) if name.endswith(".csv")]
+    if not all(Path(table).is_file() for table in tables):  # a sweep over trajectories has a sweep.csv, too
+        return
     where = f"; its numbers are in {' and '.join(tables)}" if tables else ""
     read = f"; it is read by {listed(f'en4dvar {command}' for command in kind.readers)}" if kind.readers else ""
     raise OutputError(f"{folder}: holds a run of the kind {kind.name}, and no posterior.nc of an estimate{where}{read}")

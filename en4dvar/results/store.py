@@ -197,7 +197,8 @@ def posterior_file(run_dir: str | Path) -> Path:
     require_settled(path.parent)
     if not path.is_file():
         require_no_other(path.parent)
-        raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
+        lacks = "holds no posterior.nc; is it the directory of a finished run?"
+        raise OutputError(f"{run_dir}: {lacks if path.parent.exists() else 'no such file or directory'}")
     return path
 
 

@@ -45,7 +45,7 @@ def test_a_fall_to_a_share_of_the_maximum() -> None:
     assert cut(3 * BOUNCES, "start", "80 % of the maximum or end") == (0.0, above)
     assert cut(BOUNCES, "start", "20 % of maximum or minimum 2") == (0.0, 2.0)
     assert cut(np.sort(BOUNCES), "start", "80% of maximum or end") == (0.0, 4.0)
-    with pytest.raises(DataError, match=r"asks for 20 % of maximum, but no reading .*'to: 20 % of maximum or end'"):
+    with pytest.raises(DataError, match=r"asks for 20 % of maximum, but no reading .* write '20 % of maximum or end'"):
         cut(BOUNCES, "start", "20 % of maximum")
     for text in ("0 % of maximum", "100 % of maximum", "20 kPa% of maximum", "20 % of minimum", "20 % of R_max"):
         with pytest.raises(UnitError, match=r"share must lie between|is not an instant|unit"):

@@ -116,7 +116,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
     for runs, message in (
         ([one, one], "given twice"),
         ([one], "at least two"),
-        ([one, tmp_path / "nowhere"], "nowhere: holds no posterior.nc; is it"),
+        ([one, tmp_path / "nowhere"], "nowhere: no such file or directory"),
         ([load_stored(next(one.rglob("*.nc")))] * 2, "have no names"),
     ):
         with pytest.raises(OutputError, match=message):

@@ -107,11 +107,13 @@ READ = {"rerun": (), "export": (), "compare": ("again",), "joint": (), "populati
 def test_a_command_that_does_not_read_a_kind_of_run_names_it_and_those_that_do(
     tmp_path: Path, name: str, command: str
 ) -> None:
-    """Only the result's file is there, and empty: what reads it says that it is damaged."""
+    """Only the result and its tables are there, and empty: what reads them says that they are damaged."""
     kind = kind_named(name)
+    tables = [file for file in (*kind.files, *kind.pages) if file.endswith(".csv") and "*" not in file]
     for folder in ("done", "again"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / kind.result).write_bytes(b"")
+        for file in (kind.result, *tables):
+            (tmp_path / folder / file).write_bytes(b"")
     done = call(tmp_path, command, "done", *READ[command])
     told = f"done: holds a run of the kind {name}, and no posterior.nc of an estimate"
     if command in kind.readers:
@@ -120,6 +122,14 @@ def test_a_command_that_does_not_read_a_kind_of_run_names_it_and_those_that_do(
         assert done.exit_code == 2
         assert told in done.stderr
         assert all(f"en4dvar {reader}" in done.stderr for reader in kind.readers)
+
+
+def test_a_table_of_the_same_name_makes_no_run_of_a_kind(tmp_path: Path) -> None:
+    """``en4dvar sweep`` writes a table of trajectories called as that of a sweep over twin experiments."""
+    (tmp_path / "done").mkdir()
+    (tmp_path / "done" / "sweep.csv").write_bytes(b"")
+    said = call(tmp_path, "export", "done").stderr
+    assert "done: holds no posterior.nc; is it the directory of a finished run?" in said
 
 
 @pytest.mark.fault("own-files")
