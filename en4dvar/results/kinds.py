@@ -38,7 +38,7 @@ def require_no_other(folder: Path) -> None:
     if kind is kind_named("estimate"):
         return
     tables = [str(folder / name) for name in (*kind.files, *kind.pages) if name.endswith(".csv")]
-    if not all(Path(table).is_file() for table in tables):  # a sweep over trajectories has a sweep.csv, too
+    if not all((folder / name).is_file() for name in kind.files if name.endswith(".csv")):  # another's sweep.csv
         return
     where = f"; its numbers are in {' and '.join(tables)}" if tables else ""
     read = f"; it is read by {listed(f'en4dvar {command}' for command in kind.readers)}" if kind.readers else ""
