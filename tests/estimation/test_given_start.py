@@ -9,6 +9,7 @@ from run_files import configuration, make_campaign
 import en4dvar
 from en4dvar.config import load_config
 from en4dvar.config.context import Context
+from en4dvar.config.document import parse_document
 from en4dvar.config.load import values_of
 from en4dvar.config.parameters import Uncertain
 from en4dvar.config.schema import GivenStart
@@ -140,4 +141,4 @@ def test_a_relative_file_lies_beside_the_configuration_and_is_recorded_in_full(t
     section = GivenStart.model_validate({"from": "before.csv"}, context=Context(tmp_path))
     assert section.as_written({"from": "before.csv"}) == {"from": str(tmp_path / "before.csv")}
     read = {name: Uncertain(Parameter(name, "1"), spec=None) for name in ("a", "b")}
-    assert values_of(section, tuple(read.values()), None) == {"a": 1.0, "b": 1.2}
+    assert values_of(section, tuple(read.values()), parse_document("name: x")) == {"a": 1.0, "b": 1.2}
