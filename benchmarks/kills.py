@@ -1,8 +1,8 @@
 """Commands that can be continued are killed at random: python benchmarks/kills.py [KILLS] [--seed 1] [COMMAND ...]
 
-Each is killed (SIGKILL) after a random part of the time that it takes undisturbed, continued, killed again, until it
-ends; then its tables and results are compared with those of the undisturbed one, and it begins anew until it has been
-killed KILLS times (default 20).
+Each is killed (SIGKILL) after a random part of the time that it takes undisturbed, continued, killed again, each time
+perhaps a little later, until it ends; then its tables and results are compared with those of the undisturbed one, and
+it begins anew until it has been killed KILLS times (default 20).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ def survive(siege: Siege, name: str, command: Command, kills: int, seed: int) ->
     *_, timed = siege.children.attempt(twice, timeout=LONGEST)  # the first compiles
     fault = "" if timed.code == 0 else timed.told
     while killed < kills and not fault:
-        out, again = siege.base / "killed" / f"{name}{whole}", list[str]()
+        out, again, latest = siege.base / "killed" / f"{name}{whole}", list[str](), timed.seconds
         while True:
             task = Task([*command.into(out), *again], seconds=LONGEST, stop=signal.SIGKILL)
-            task.after = float(rng.uniform(0, timed.seconds))
+            task.after, latest = float(rng.uniform(0, latest)), 1.1 * latest  # to continue may take longer
             (found,) = siege.children.attempt([task])
             if found.code != -signal.SIGKILL:
                 break
