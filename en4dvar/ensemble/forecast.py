@@ -313,9 +313,10 @@ def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
 
 def clock_of(problem: InverseProblem, physical: Array) -> tuple[Array, Array]:
     """Scale a and shift t_s (B,) of the times at which members are observed."""
-    own = not problem.has_time_scale
-    scale = np.ones(len(physical)) if own else of_framework(problem, physical, TIME_SCALE, 1.0)
-    return scale, of_framework(problem, physical, TIME_SHIFT, 0.0)
+    shift = of_framework(problem, physical, TIME_SHIFT, 0.0)
+    if not problem.has_time_scale:
+        return np.ones_like(shift), shift
+    return of_framework(problem, physical, TIME_SCALE, 1.0), shift
 
 
 def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:

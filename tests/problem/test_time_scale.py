@@ -83,14 +83,8 @@ def test_simulated_from_yaml_it_stretches_the_clock(tmp_path: Path) -> None:
     config, curves = write_toy(tmp_path), []
     for scale, times in (("1", "10 ms:100 ms:10 ms"), ("2", "5 ms:50 ms:5 ms")):
         out = tmp_path / f"{scale}.csv"
-        truth = [
-            "--set",
-            "parameters.k=2 N/m",
-            "--set",
-            f"parameters.time_scale={scale}",
-            "--set",
-            "parameters.A=100 um",
-        ]
+        truths = ("k=2 N/m", "A=100 um", f"time_scale={scale}")
+        truth = [word for value in truths for word in ("--set", f"parameters.{value}")]
         outcome = CliRunner().invoke(main, ["simulate", str(config), *truth, "--times", times, "--out", str(out)])
         assert outcome.exit_code == 0, outcome.output
         curves.append(np.loadtxt(out.read_text().splitlines()[-10:], delimiter=",")[:, 1])
