@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from en4dvar.commands.common import Failed, ask, deliver, echo, folder_of, from_here, tell, trust_option, workers_option
+from en4dvar.commands.common import (
+    Failed,
+    ask,
+    continuable,
+    deliver,
+    echo,
+    folder_of,
+    from_here,
+    tell,
+    trust_option,
+    workers_option,
+)  # fmt: skip
 from en4dvar.plumbing.errors import OutputError
 
 if TYPE_CHECKING:
@@ -233,7 +244,7 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
 
 
 def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
-    """The arguments RUN_DIR with --out, --force, --workers and --trust of an estimate of finished runs together.
+    """The arguments RUN_DIR, and the options that estimates of finished runs together have in common.
 
     It gets the runs, the folder of its result, and keywords of what computes it. What it returns is printed, warnings
     on standard error.
@@ -246,17 +257,22 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
     @click.option(
         "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside the first."
     )
+    @click.option("--force", is_flag=True, help="Begin anew; an earlier result is replaced in any case.")
     @click.option(
-        "--force", is_flag=True, expose_value=False, help="Accepted as by 'run'; an earlier result is replaced anyway."
-    )
+        "--resume", is_flag=True,
+        help="Keep a result that is whole; an interrupted estimate continues in any case, to the same numbers.",
+    )  # fmt: skip
     @workers_option
     @trust_option
     @functools.wraps(command)
     def with_runs(
-        run_dirs: tuple[Path, ...], out: Path | None, workers: int | None, trust: bool, **options: Any
-    ) -> None:
-        how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell}
-        table, cautions, page = command(run_dirs, out or folder_of(kind, run_dirs), how, **options)
+        run_dirs: tuple[Path, ...], out: Path | None, workers: int | None, trust: bool, force: bool, resume: bool,
+        **options: Any,
+    ) -> None:  # fmt: skip
+        how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell, "force": force, "resume": resume}
+        folder = out or folder_of(kind, run_dirs)
+        with continuable(folder, resume):
+            table, cautions, page = command(run_dirs, folder, how, **options)
         echo(table)
         for caution in cautions:
             echo(f"{caution.kind}: {caution}", err=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from types import GenericAlias
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
@@ -114,6 +114,12 @@ class RunKind(Kind, ABC, Generic[R]):
         """End what computes in threads of this process."""
 
 
+class Log(Protocol):
+    """Where a run at work writes what it does."""
+
+    def write(self, message: str, /) -> None: ...
+
+
 @dataclass
 class Session:
     """A run at work in its directory.
@@ -124,7 +130,7 @@ class Session:
 
     config: Any
     directory: RunDirectory
-    log: RunLog
+    log: Log
     identity: Identity
     attributes: Mapping[str, str]
     notices: list[str] = field(default_factory=list)

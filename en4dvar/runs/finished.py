@@ -33,6 +33,7 @@ class Finished:
     ``drawn``: draws of its posterior, where it was sampled. Data sets of one name in several runs get a number.
     """
 
+    config: Config
     problem: InverseProblem
     members: Array
     white: Array
@@ -96,7 +97,7 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
         white = prior.white(prior.from_physical(np.vstack([members, centre])))
         drawn = _kept_draws(problem, result)
     groups = config.sharing.of_dataset(result.name)
-    return Finished(problem, members, white[:-1], centre, result.cautions, groups, drawn)
+    return Finished(config, problem, members, white[:-1], centre, result.cautions, groups, drawn)
 
 
 def _kept_draws(problem: InverseProblem, result: StoredResult) -> OwnDraws | None:

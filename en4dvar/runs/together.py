@@ -8,6 +8,7 @@ parameters over data sets (``en4dvar population``).
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,10 +31,12 @@ from en4dvar.plumbing.hints import listed, rounded
 from en4dvar.problem import InverseProblem
 from en4dvar.results import together as stored
 from en4dvar.results.checkpoint import FOLDER, Journal, KnownRuns, digest, file_digest, write_checkpoint
-from en4dvar.results.provenance import provenance
+from en4dvar.results.pack import PACK
+from en4dvar.results.provenance import Identity, identity, provenance
 from en4dvar.results.store import load_stored
-from en4dvar.runs.engine import Kind
+from en4dvar.runs.engine import Kind, Session, directory_mode
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
+from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
@@ -76,26 +79,61 @@ class TogetherKind(Kind, ABC):
 
     def of_runs(
         self, run_dirs: Sequence[Path], out: Path, workers: int | None = None, trust: bool = False,
-        ask: Ask | None = None, tell: Tell = lambda words: None,
+        ask: Ask | None = None, tell: Tell = lambda words: None, force: bool = False, resume: bool = False,
     ) -> tuple[Path, Path]:  # fmt: skip
         """Of the data sets of finished runs, with the settings of the first; returns the paths of result and page.
+
+        What an interrupted estimate of the same had run is not run again, unless ``force`` is given; with ``resume``,
+        nor is a finished one made again.
 
         Raises RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result,
         it is damaged, or a file that no run wrote would be replaced. Others as of :meth:`estimate`.
         """
-        names = (*self.files, *self.pages)
-        with RunDirectory.open(out, "beside", names) as directory:
+        names, record, mode = (*self.files, *self.pages), self.records[0], directory_mode(force, resume)
+        with terminate_as_interrupt(), RunDirectory.open(out, "beside", names) as directory:
             config, sets = finished(run_dirs, trust, ask)
             attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
+            configs = {s.config.resolved: s.config for s in sets}.values()
+            made_of = [repr(self), *(identity(c.resolved, c.model, {}).settings for c in configs)]
+            made_of += [file_digest(run_dir / name) for run_dir in run_dirs for name in (PACK, "posterior.nc")]
+            session = Session(config, directory, _Terminal(tell), Identity("", ()), attributes)
             try:
-                directory.claim(*names)
-                with choose_executor(config.model, None, workers) as executor:
-                    self.estimate(sets, config, executor, attributes, directory.at(self.result), tell)
-                page = self.page(directory.work)
+                directory.claim(*names, record, under_way(record))
+                directory.folder(FOLDER)
+                if mode != "resume":
+                    directory.remove(record)
+                if mode == "force":
+                    directory.remove(under_way(record))
+                with tell_interrupt(lambda: f"the forward runs are kept in {out}"):
+                    with choose_executor(config.model, None, workers) as executor:
+                        self._estimate(session, lambda: sets, executor, attributes, self.result, record, made_of, tell)
+                    page = self.page(directory.work)
             finally:
+                with suppress(OSError):  # where nothing is kept
+                    directory.at(FOLDER).rmdir()
                 directory.publish()
         assert page is not None
         return out / self.result, out / page.name
+
+    def _estimate(
+        self, run: Session, sets: Callable[[], Sequence[Finished]], executor: Executor, attributes: Mapping[str, Any],
+        file: str, record: str, made_of: Sequence[str], tell: Tell,
+    ) -> None:  # fmt: skip
+        """Estimate the ``sets`` and write the result into a ``file`` of the run, unless it is there, ``made_of`` the
+        same, as ``record`` says. Forward runs are kept until it is whole.
+        """
+        again, fingerprint = f"the {self.what} is made again", digest("\n".join(made_of).encode())
+        path = run.directory.at(file)
+        done = run.restore(record, fingerprint, str, again)
+        if done is not None and path.exists() and file_digest(path) == done:
+            return
+        known, keeper = run.kept(under_way(record), fingerprint, KnownRuns, again)
+        if known:
+            tell(f"continued after {sum(map(len, known.forecasts))} forward runs")
+        journal = Journal(executor, known or KnownRuns(), keeper)
+        self.estimate(sets(), run.config, journal, attributes, path, tell)
+        write_checkpoint(run.directory.at(record), fingerprint, file_digest(path))
+        run.directory.remove(under_way(record))
 
     def within(self, work: Worklist, executor: Executor, group: SetGroup | None = None) -> None:
         """Of the data sets of a run (or of one ``group`` of them) that have a posterior, at its end; too few of them
@@ -110,24 +148,33 @@ class TogetherKind(Kind, ABC):
             run.notice(f"no {what}, for which {self.fewest} data sets need a posterior; {len(good)} have one")
             return
         digests = (f"{d.name}: {work.pack.entries[d.stem].content_digest}" for d in good)
-        made_of = [run.identity.settings, *digests]
-        fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(self.result)
-        record = self.records[0]
+        file, record = self.result, self.records[0]
         if group:
-            path = run.directory.folder(group.folder) / self.result
+            run.directory.folder(group.folder)
+            file = f"{group.folder}/{file}"
             record = f"{record}_{group.folder.replace('/', '_')}"
-        again, under_way = f"the {what} is made again", f"{record}.iteration"
-        done = run.restore(record, fingerprint, str, again)
-        if done is not None and path.exists() and file_digest(path) == done:
-            return
-        sets = [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
+
+        def sets() -> list[Finished]:
+            return [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
+
         attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
         attributes |= {"group": group.name} if group else {}
-        known, keeper = run.kept(under_way, fingerprint, KnownRuns, again)
-        journal = Journal(executor, known or KnownRuns(), keeper)
-        self.estimate(sets, config, journal, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
-        write_checkpoint(run.directory.at(record), fingerprint, file_digest(path))
-        run.directory.remove(under_way)
+        self._estimate(
+            run, sets, executor, attributes, file, record, [run.identity.settings, *digests],
+            lambda words: run.log.write(f"{what}: {words}"),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Terminal:
+    """In place of the log of a run: ``write`` tells the user."""
+
+    write: Tell
+
+
+def under_way(record: str) -> str:
+    """The file of the forward runs of an estimate under way."""
+    return f"{record}.iteration"
 
 
 def join(

@@ -44,9 +44,9 @@ def commands(base: Path) -> dict[str, Command]:
         "study": ["study", str(base / "study" / "study.yaml")],
     }
     found = {name: Command(words, resume) for name, words in runs.items()}
-    found |= {  # these are given again
-        "joint": Command(["joint", campaign, "--share", "k"], []),
-        "population": Command(["population", campaign, "--of", "k"], []),
+    found |= {
+        "joint": Command(["joint", campaign, "--share", "k"], []),  # they continue by themselves, or are told to
+        "population": Command(["population", campaign, "--of", "k"], resume),
         "compare": Command(["compare", campaign, str(base / "other")], []),
         "control file": Command(["python", "siege_files", "pest", str(base / "pest" / "line.pst")]),
         "rerun": Command(["rerun", campaign], out=False),
