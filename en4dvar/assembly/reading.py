@@ -7,6 +7,7 @@ import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,16 +20,18 @@ from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import DecayingErrors, Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
-from en4dvar.inputs.formats import SUFFIXES
+from en4dvar.inputs.formats import SUFFIXES, TRUTHS
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
 from en4dvar.inputs.readers import Rows, read_series
 from en4dvar.inputs.window import vertex
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.files import PathError, expanded, readable
+from en4dvar.plumbing.files import PathError, expanded, open_plain, readable
 from en4dvar.plumbing.hints import natural
 from en4dvar.plumbing.units import convert
+
+LONGEST_HEAD = 4096  # bytes of a line of names
 
 
 def with_parts(
@@ -46,9 +49,12 @@ def with_parts(
     return by_name
 
 
-def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
+def find_files(
+    base: Path, texts: Sequence[str], left_out: Callable[[Path], object] = lambda path: None
+) -> dict[str, Path]:
     """:func:`data_files` of paths, folders and patterns relative to ``base``. Of a folder without data files those of
-    its subfolders are taken, and each is named after its subfolder and itself. Raises :class:`DataError`.
+    its subfolders are taken, and each is named after its subfolder and itself. Truths of a simulated campaign, in a
+    folder or among what matches a pattern, are ``left_out``, which is told of each. Raises :class:`DataError`.
     """
     paths: list[Path] = []
     grouped: set[Path] = set()
@@ -56,15 +62,15 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
         with retold(PathError, DataError):
             path = base / expanded(text)
         if glob.has_magic(text) and not os.path.exists(path):
-            matches = sorted(map(Path, glob.glob(str(path), recursive=True)), key=natural)
-            if not matches:
+            every = sorted(map(Path, glob.glob(str(path), recursive=True)), key=natural)
+            if not (matches := _without_truths(every, left_out)):
                 raise DataError(f"{path}: no file matches")
             paths += matches
         elif os.path.isdir(path):
-            held = _data_files(path)
+            held = _data_files(path, left_out)
             if not held:
                 folders = sorted((p for p in _beside(path) if p.is_dir() and p.name[0] != "."), key=natural)
-                held = [file for folder in folders for file in _data_files(folder)]
+                held = [file for folder in folders for file in _data_files(folder, left_out)]
                 grouped.update(held)
             if not held:
                 raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
@@ -82,9 +88,26 @@ def _beside(folder: Path) -> list[Path]:
         return list(folder.iterdir())
 
 
-def _data_files(folder: Path) -> list[Path]:
+def _data_files(folder: Path, left_out: Callable[[Path], object]) -> list[Path]:
     held = [p for p in _beside(folder) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
-    return sorted(held, key=natural)
+    return sorted(_without_truths(held, left_out), key=natural)
+
+
+def _without_truths(paths: Sequence[Path], left_out: Callable[[Path], object]) -> list[Path]:
+    truths = [path for path in paths if _holds_truths(path)]
+    for path in truths:
+        left_out(path)
+    return [path for path in paths if path not in truths]
+
+
+def _holds_truths(path: Path) -> bool:
+    """Whether a file is the table of truths that ``en4dvar simulate`` writes beside the data sets of a campaign."""
+    if path.suffix == ".csv":
+        with suppress(OSError), open_plain(path) as file:
+            lines = iter(lambda: file.readline(LONGEST_HEAD), b"")
+            head = next((line for line in lines if not line.startswith(b"#")), b"").strip().split(b",")
+            return (*head[:2], head[-1]) == tuple(name.encode() for name in TRUTHS)
+    return False
 
 
 def _unique_names(paths: list[Path], grouped: Set[Path]) -> list[str]:

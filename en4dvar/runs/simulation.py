@@ -25,6 +25,7 @@ from en4dvar.config.quantities import parse_error_std
 from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
+from en4dvar.inputs.formats import TRUTHS
 from en4dvar.inputs.parts import Column
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of, read_along
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
@@ -290,7 +291,7 @@ def truth_csv(plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...]) -> str:
     display = {p.name: (p.unit, p.display_unit or p.unit) for p in plan.model.parameters}
     display[TIME_SHIFT.name] = (plan.model.time_unit, plan.model.time_display_unit)
     heads = [name if unit == "1" else f"{name}_{unit.replace(' ', '_')}" for name, (_, unit) in display.items()]
-    rows = [["dataset", "group", *heads, "nrmse_of_truth"]]
+    rows = [[*TRUTHS[:2], *heads, TRUTHS[2]]]
     for s in sets:
         row = [f"{convert(s.truth[name], *units):.9g}" for name, units in display.items()]
         rows.append([s.name, s.group, *row, f"{s.nrmse:.4f}"])

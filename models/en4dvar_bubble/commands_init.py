@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import click
 
-from en4dvar.commands.common import Failed, command_line, echo
+from en4dvar.commands.common import Failed, command_line, echo, from_here
 from en4dvar.inputs.formats import Disorder, Format, Repeated
 from en4dvar.plumbing.errors import En4dvarError, OutputError, retold
 from en4dvar_bubble.commands import completed_law
@@ -242,7 +242,11 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
     from en4dvar_bubble.starter.summaries import summaries
 
     _refuse_movie(Path(data))
-    files = list(find_files(Path.cwd(), [data]).values())
+
+    def left_out(table: Path) -> None:
+        echo(f"{from_here(table)}: the truths of a simulated campaign are no data set, and left out", err=True)
+
+    files = list(find_files(Path.cwd(), [data], left_out).values())
     first, contents, layout = first_with_columns(files, layout)
     asked = Asked(contents, **{key: options[key] for key in _OF_COLUMNS})
     commas = ", decimal commas" if layout.decimal == "," else ""

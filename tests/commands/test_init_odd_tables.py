@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from click.testing import CliRunner
 from init_files import call, proposed, write
 
+from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.cli import main
+from en4dvar.config import load_config
 from en4dvar.inputs.implausible import outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import Layout, read_contents
 from en4dvar_bubble.starter.grouped import ends_with
@@ -236,3 +239,20 @@ def test_files_of_two_kinds_of_names_may_be_of_two_gels(names: list[str], told: 
     assert words.startswith("at its end the run estimates their one gel")
     assert told in words
     assert ("add --groups gels.csv" in words) == bool(told)
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_the_truths_of_a_simulated_campaign_are_no_data_set(tmp_path: Path) -> None:
+    """Whatever the table is called, for a folder, a pattern and the run; a table that only has its name is one."""
+    twin, folder = Path(__file__).resolve().parents[2] / "configs" / "data" / "agarose_twin", tmp_path / "twin"
+    folder.mkdir()
+    (folder / "answers.csv").write_text((twin / "truth.csv").read_text())
+    shutil.copy(twin / "agarose_03_01.csv", folder / "truth.csv")
+    for data in (folder, folder / "*.csv"):
+        done = call("init", "--data", data, "--out", "twin.yaml", "--force")
+        assert done.exit_code == 0, done.stderr
+        lines = [line for line in done.stderr.splitlines() if "answers" in line]
+        assert lines == ["twin/answers.csv: the truths of a simulated campaign are no data set, and left out"]
+        assert [*data_files(inverse_plan(load_config("twin.yaml")))] == ["truth"]
+    done = call("init", "--data", folder / "answers*.csv", "--out", "none.yaml")
+    assert (done.exit_code, "no file matches" in done.stderr) == (2, True)
