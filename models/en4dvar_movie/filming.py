@@ -62,10 +62,12 @@ def film(config: "Config", times: Array | None, out: Path, settings: Mapping[str
     radii = simulate(config, instants).values[where].reshape(exposed.shape) / camera.pixel
     frames = render(radii, scene, rng)
     write_movie(out, frames, scene.before + len(at), camera.pixel, 1 / float(steps.mean()))
+    empty, (height, width), first = scene.before, scene.shape, 1e6 * (at[0] - scene.before * steps.mean())
+    cut = "; the frame cuts the outline, a larger shape or pixel shows it" * bool(2 * radii.max() > min(scene.shape))
     return (
-        f"movie: {out}, {scene.before + len(at)} frames of {scene.shape[1]} × {scene.shape[0]} pixels of "
-        f"{1e6 * camera.pixel:g} um; the first {scene.before} are empty, so that frame {scene.before} is at "
-        f"{1e6 * at[0]:g} us; radii from {radii.min():.1f} to {radii.max():.1f} pixels"
+        f"movie: {out}, {empty + len(at)} frames of {width} × {height} pixels of {1e6 * camera.pixel:g} um; the first "
+        f"{empty} are empty, so that frame {empty} is at {1e6 * at[0]:g} us and frame 0, from which 'track' counts, "
+        f"at {round(first, 6) + 0:g} us; radii from {radii.min():.1f} to {radii.max():.1f} pixels{cut}"
     )
 
 

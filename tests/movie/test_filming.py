@@ -57,6 +57,17 @@ def test_the_movie_shows_the_simulated_radii(config, tmp_path, name):
     assert (tmp_path / ("again" + name)).read_bytes()[-5000:] == (tmp_path / name).read_bytes()[-5000:]
 
 
+def test_it_is_told_where_the_clock_of_the_table_begins_and_that_the_frame_is_too_small(config, tmp_path):
+    """Four empty frames before the first instant, the fourth of the steps, and the clocks of both agree."""
+    agree, cut = "frame 4 is at 40 us and frame 0, from which 'track' counts, at 0 us;", "a larger shape or pixel"
+    words = film(config, TIMES + 4e-5, tmp_path / "a.tif", {"before": "4"}, 3)
+    assert agree in words
+    assert cut not in words
+    words = film(config, TIMES, tmp_path / "b.tif", {"pixel": "1 um"}, 3)
+    assert "frame 3 is at 0 us and frame 0, from which 'track' counts, at -30 us;" in words
+    assert words.endswith(f"; the frame cuts the outline, {cut} shows it")
+
+
 def test_sixteen_bits(config, tmp_path):
     film(config, TIMES, tmp_path / "m.tif", {"bits": "16", "level": "20000", "noise": "300", "before": "0"}, 1)
     frames = list(open_movie(tmp_path / "m.tif").frames())
