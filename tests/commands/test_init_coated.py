@@ -40,6 +40,8 @@ def test_a_coated_bubble_in_water(law: str) -> None:
     driving = problem.model.driving  # type: ignore[attr-defined]
     assert 50e3 < driving.amplitude < 1e6  # as of a scanner, no pulse that tears tissue
     assert driving.end > 3e-6
+    clock = problem.prior.std[problem.prior.names.index("t_s")]
+    assert clock < 0.25 * driving.end / 8  # of eight cycles: shifts by one, each of which may fit, are not among it
     assert problem.fixed["mu"] == pytest.approx(0.89e-3, rel=0.02)  # IAPWS 2008, 25 °C
     buckles = law in ("marmottant-shell", "gompertz-shell")
     assert problem.model.accuracy.rtol == (1e-8 if buckles else preset("standard", "acoustic").rtol)  # type: ignore[attr-defined]

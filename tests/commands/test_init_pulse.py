@@ -56,6 +56,24 @@ def test_a_guessed_clock_is_as_exact_late_as_early(gel: dict[str, float]) -> Non
         assert abs(proposed_zero - zero) < 2 * terms["t_s"].std
 
 
+@pytest.mark.parametrize("late", [0.0, 20.0])
+def test_bubbles_whose_clocks_begin_at_other_instants_of_the_pulse_are_named(late: float) -> None:
+    """Of one gel and different nuclei; all have one ``time_zero``."""
+    Path("d").mkdir()
+    times = np.arange(5.6, 34.0, 1.0)
+    for number, size in enumerate((0.3e-6, 0.43e-6, 0.6e-6)):
+        radius = 1e6 * bubble_path("quadratic-kelvin-voigt", {**SOFT, "R0": size}, 1e-6 * times).R[0].values
+        rows = [f"{t + late * (number == 1):.2f},{r:.3f}" for t, r in zip(times, radius, strict=True)]
+        Path(f"d/b{number}.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "d", "--start", "acoustic")
+    assert done.exit_code == 0, done.output
+    named = [line for line in done.stderr.splitlines() if "one time_zero is for all files" in line]
+    assert bool(named) == bool(late)
+    assert all(
+        re.match(r"warning: b1: the bubble grows up to (19|20|21)\S* us before or after most", it) for it in named
+    )
+
+
 def test_a_window_to_the_end_says_why_it_does_not_end_before() -> None:
     of_file(STIFF, 0.0)
     (line,) = (line for line in Path("pulse.yaml").read_text().splitlines() if line.startswith("  window:"))

@@ -14,7 +14,7 @@ import numpy as np
 
 from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
-from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_bubble.collapse import doubt
 from en4dvar_bubble.laws.base import ConstitutiveLaw
@@ -71,12 +71,43 @@ PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather changes it by 1 %, 100 m o
 HISTOTRIPSY = {"kind": "histotripsy", "amplitude": "-24 MPa", "frequency": "1 MHz", "exponent": "3.7", "delay": "5 us"}
 DIAGNOSTIC = {"kind": "sine", "amplitude": "100 kPa", "frequency": "2 MHz", "cycles": "8", "envelope": "hann"}
 
+CLOCK_STD, CLOCK_SHARE = 1e-6, 0.1  # s, of 30 synthetic bubbles a guessed clock erred by 1.05e-6 (rms); of a period
+CLOCKS_APART = 4e-6  # s: bubbles of one gel that differ in size grow this much apart
+
 
 def example_pulse(law: ConstitutiveLaw) -> Mapping[str, str]:
     """Keys of a pulse and their values, as made such a bubble in published experiments: a coated one is driven by a
     burst as of a scanner, one in a gel grows in the tension of a histotripsy pulse.
     """
     return DIAGNOSTIC if law.sized else HISTOTRIPSY
+
+
+def clock(pulse: Mapping[str, str]) -> Entry:
+    """The line of the time shift. In a burst of several cycles a shift by a period changes little, and each would be a
+    mode; half a cycle makes one bubble.
+    """
+    words, std = "the clock of the data against that of the pulse", CLOCK_STD
+    if "cycles" in pulse:
+        std = CLOCK_SHARE / parse_quantity(pulse["frequency"], "Hz", "MHz")
+        words += (
+            f": a camera that the pulse triggers is known to {100 * CLOCK_SHARE:g} % of its period, or to what you "
+        )
+        words += "enter; with half a period or more it may fit in several modes"
+    return Entry("t_s", f"{{prior: normal, mean: 0 us, std: {1e6 * std:.3g} us}}", words)
+
+
+def clocks_apart(looks: Mapping[str, Look]) -> list[str]:
+    """Whose pulse comes at another instant of its clock than those of most. A bubble grows for about as long as it
+    collapses.
+    """
+    grows = {name: view.lobe.t_max - view.lobe.t_c for name, view in looks.items()}
+    usual, t_c = np.median([*grows.values()]), np.median([view.lobe.t_c for view in looks.values()])
+    off = {name: abs(at - usual) for name, at in grows.items() if abs(at - usual) > max(CLOCKS_APART, 0.5 * t_c)}
+    words = (
+        f"{listed(off, 5)}: the bubble grows up to {1e6 * max(off.values(), default=0.0):.3g} us before or after most, "
+        "and one time_zero is for all files: begin the times of each at its pulse"
+    )
+    return [words] * bool(off)
 
 
 def amplitude(pulse: Mapping[str, str]) -> Entry:

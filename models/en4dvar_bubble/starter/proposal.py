@@ -68,7 +68,7 @@ GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at r
 # Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
 WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess had a root mean square of 2.1
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
-SAME_CLOCK, CLOCK_STD = 2e-6, 1e-6  # s: of a guessed clock; of 30 synthetic bubbles it erred by 1.05e-6 (rms)
+SAME_CLOCK = 2e-6  # s: of a guessed clock
 COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
 EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
@@ -153,7 +153,7 @@ def propose(
         warnings.append(_unmatched(guess.unmatched, look, model))
     elif guess.misfit > FAR:
         believed = Guess({}, {}, 0.0)  # made with an example of a pulse
-    warnings += without_rebound(looks)
+    warnings += without_rebound(looks) if chosen == "laser" else elsewhere.clocks_apart(looks)
     if chosen == "laser" and "G" in guess.values:
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     elif "G" in guess.values:
@@ -218,9 +218,10 @@ def starter(start: Start, law: str | None) -> Proposal:
         words = "if readings show two collapses, 'to: trough 2' ends it at the second"
         data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "top")]
     lines = [example(p, model) for p in model.law.parameters]
-    lines += _radii(start, None)
-    lines += [elsewhere.amplitude(elsewhere.example_pulse(model.law))] * (start == "acoustic")
-    lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
+    pulse = elsewhere.example_pulse(model.law)
+    shift = Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")
+    clocks = [elsewhere.amplitude(pulse), elsewhere.clock(pulse)] if start == "acoustic" else [shift]
+    lines += [*_radii(start, None), *clocks]
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
 
@@ -425,16 +426,15 @@ def _parameters(
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = water[R_EQ.name]
     lines += radii.values()
-    lines += [elsewhere.amplitude(elsewhere.example_pulse(model.law))] * (start == "acoustic")
-    mean, std = (0.0, CLOCK_STD) if start == "acoustic" else top.t_s
-    prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
-    words = "the clock of the data against that of the pulse"
-    if start == "laser":
-        words = "the vertex of a parabola through the readings about the top, relative to the top itself"
+    pulse = elsewhere.example_pulse(model.law)
+    lines += [elsewhere.amplitude(pulse)] * (start == "acoustic")
+    mean, std = (_text(value, "s", "us", digits) for value, digits in zip(top.t_s, (4, 2), strict=True))
+    words = "the vertex of a parabola through the readings about the top, relative to the top itself"
+    at_top = Entry("t_s", f"{{prior: normal, mean: {mean}, std: {std}}}", words)
     sigma = f"{{prior: lognormal, median: 1, log_std: {NOISE_LOG_STD:g}}}"
     return (
         *lines,
-        Entry("t_s", prior, words),
+        elsewhere.clock(pulse) if start == "acoustic" else at_top,
         Entry("sigma", sigma, "scale of the stated errors"),
         *(it.prior() for it in elsewhere.known(medium, scale)),
     )
