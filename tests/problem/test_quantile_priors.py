@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.integrate import quad
+from scipy.special import ndtr, ndtri
 from toy_config import write_toy
 from toys import OBSERVABLE, Vectorised, make_observations
 
@@ -16,6 +17,7 @@ from en4dvar.diagnosis.honesty.checks import at_bound
 from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors import parameter_map
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
@@ -68,6 +70,26 @@ def test_moments_by_quadrature_and_of_draws(name):
     drawn = Prior((term,)).to_physical(Prior((term,)).sample(4000, 1))[:, 0]
     assert drawn.mean() == pytest.approx(named.mean(), abs=4 * named.std() / math.sqrt(4000))
     assert stats.kstest(drawn, named.cdf).pvalue > 0.01
+
+
+def test_a_kind_of_ones_own_needs_its_map_alone(monkeypatch):
+    """As CONTRIBUTING says, here log-uniform between a and b; its one number is ln b/a."""
+    own = parameter_map.QuantileMap(
+        below=lambda x, shape: np.expm1(shape[0] * ndtr(x)) / math.expm1(shape[0]),
+        above=lambda x, shape: np.expm1(-shape[0] * ndtr(-x)) / math.expm1(-shape[0]),
+        score=lambda u, rest, shape: np.where(
+            u * math.expm1(shape[0]) < math.expm1(shape[0] / 2),
+            ndtri(np.log1p(u * math.expm1(shape[0])) / shape[0]),
+            -ndtri(-np.log1p(rest * math.expm1(-shape[0])) / shape[0]),
+        ),
+        log_density=lambda u, rest, shape: -math.log(shape[0] * (u + 1 / math.expm1(shape[0]))),
+    )
+    monkeypatch.setitem(parameter_map.QUANTILE_MAPS, "log-uniform", own)
+    term = PriorTerm._by_quantiles(A, "log-uniform", (0.1, 10.0), (math.log(100),))
+    monkeypatch.setitem(NAMED, "log-uniform", (term, stats.loguniform(0.1, 10.0)))
+    test_the_score_is_that_of_the_distribution("log-uniform")
+    test_the_density_in_the_displayed_quantity("log-uniform")
+    test_moments_by_quadrature_and_of_draws("log-uniform")
 
 
 def test_tails_keep_their_distance_to_the_bound():
