@@ -111,14 +111,22 @@ def folder_of(kind: str, run_dirs: Sequence[Path]) -> Path:
     return inside(run_dirs[0].absolute().parent, f"{kind}_{named}"[:LONGEST])
 
 
+def not_empty(_: click.Context, __: click.Parameter, text: str | None) -> str | None:
+    """A value as it was given. Raises :class:`click.BadParameter` for none, which would be as if it had not been."""
+    if text == "":
+        raise click.BadParameter("nothing is given; is a variable of the shell not set, or did a command in it fail?")
+    return text
+
+
 def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The argument CONFIG with --data and --set, which the command gets as one :class:`Source`."""
 
     @click.argument("config", type=click.Path(path_type=Path))
     @click.argument("more", nargs=-1, metavar="")
     @click.option(
-        "--data", metavar="FILE", type=click.Path(), help="Data file, folder or pattern instead of data.path."
-    )
+        "--data", metavar="FILE", type=click.Path(), callback=not_empty,
+        help="Data file, folder or pattern instead of data.path.",
+    )  # fmt: skip
     @click.option(
         "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
     )
