@@ -4,7 +4,8 @@ what about an experiment could be otherwise than assumed, each by as much as lab
 Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the ambient pressure by 2 % about its mean,
 1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
 calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
-its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away, and
+its speed of sound that of water or 3 % more; gels stiffen by an alpha of 0.03 (agarose: Mancia 2021) to 0.48
+(polyacrylamide: Yang 2020), or not at all; the walls of a dish or of the holder of a gel are millimetres away, and
 one three times the largest radius away makes a collapse 7 % longer (Rattray: 0.205 R_max/h).
 """
 
@@ -32,7 +33,8 @@ from en4dvar.plumbing.caution import Caution
 from en4dvar_bubble.collapse import SINGLE, doubts, single
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.events import OBSERVABLES
-from en4dvar_bubble.laws import get_law
+from en4dvar_bubble.laws import REGISTRY, get_law
+from en4dvar_bubble.laws.parameters import ALPHA
 from en4dvar_bubble.laws.tabulate import GRID, ends
 from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
@@ -206,6 +208,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
 
 PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
+NO_STIFFENING, STIFFENED = {ALPHA.name: 0.0}, 0.1
 NEARBY = Wall(3.0, relative=True), "three times R_max"
 NEARBY_DRIVEN = Wall(3e-3), "3 mm"
 MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
@@ -218,15 +221,16 @@ MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, wo
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
 def alternatives(model: Dynamics) -> tuple[Alternative, ...]:
-    """Those of a bubble: pulse, medium, wall, gas, vapour, radius at rest, scale, time step.
+    """Those of a bubble: pulse, law, medium, wall, gas, vapour, radius at rest, scale, time step.
 
     None in whose equations a parameter of the model has no place.
     """
-    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model) == _names(model))
+    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model, a.given) == _names(model))
 
 
-def _names(model: ForwardModel | Dynamics) -> list[str]:
-    return [p.name for p in model.parameters if p.name != WALL_DISTANCE.name]  # stated with the wall itself
+def _names(model: ForwardModel | Dynamics, given: Collection[str] = ()) -> list[str]:
+    said = {WALL_DISTANCE.name, *given}  # a wall's distance is stated with the wall itself
+    return [p.name for p in model.parameters if p.name not in said]
 
 
 def _alternatives(model: Dynamics) -> Iterator[Alternative]:
@@ -238,6 +242,9 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
+    if stiffens := next((it for it in REGISTRY.values() if (type(model.law), NO_STIFFENING) in it.limits), None):
+        words = f"the gel stiffened (law: {stiffens.name}, alpha: {STIFFENED:g})"
+        yield replace(changed("stiffening", words, law=stiffens()), given={ALPHA.name: STIFFENED})
     for name, key, factor, words in MEDIUM:
         if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
             of = "S" if name == "surface_tension" else name

@@ -63,7 +63,13 @@ STARTS = {"acoustic": acoustic, "laser": laser}
 
 @pytest.mark.parametrize(
     ("start", "name"),
-    [("acoustic", "pulse_amplitude"), ("acoustic", "length_scale"), ("laser", "time_scale"), ("laser", "length_scale")],
+    [
+        ("acoustic", "pulse_amplitude"),
+        ("acoustic", "length_scale"),
+        ("laser", "time_scale"),
+        ("laser", "length_scale"),
+        ("laser", "stiffening"),
+    ],
 )
 def test_the_predicted_change_is_that_of_a_fit_done_again(fits, start, name):
     problem, analysis = fits[start]
@@ -116,10 +122,10 @@ def test_the_influence_of_a_reading_is_that_of_a_fit_without_it(fits, start):
 def test_every_alternative_is_told_or_has_a_reason(fits, start):
     problem, analysis = fits[start]
     offered = {one.name for one in problem.model.alternatives}
-    driven = {"pulse_amplitude"} if start == "acoustic" else set()
+    own = {"pulse_amplitude"} if start == "acoustic" else {"stiffening"}  # the law of the former stiffens already
     common = {"ambient_pressure", "density", "sound_speed", "surface_tension", "gas_model", "vapour", "radius_at_rest"}
     common |= {"wall"}
-    assert offered == driven | common | {"length_scale", "time_scale"}
+    assert offered == own | common | {"length_scale", "time_scale"}
     assert {one.name for one in analysis.what_if} == offered
     for shift in analysis.what_if:
         assert np.isfinite(shift.change).all() != bool(shift.reason)

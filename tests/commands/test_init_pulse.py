@@ -48,6 +48,16 @@ def test_of_a_gel_that_a_pulse_stretches_no_prior_is_what_the_readings_say() -> 
             assert abs(np.log(gel[name]) - soft[name].mean) < 2 * soft[name].std, name
 
 
+def test_a_gel_that_does_not_stiffen_is_within_what_is_proposed() -> None:
+    """At a stretch of hundreds a small α is nearly none; a prior that excludes it gives α a part of the gel's G."""
+    alpha = of_file(SOFT, 0.0)[1]["alpha"]
+    least, times = float(np.exp(alpha.mean - 1.645 * alpha.std)), np.arange(5.6e-6, 45e-6, 1e-7)
+    gel = {"G": 2e3, "mu": 0.086, "R0": 0.6e-6}
+    stiffens = bubble_path("quadratic-kelvin-voigt", {**gel, "alpha": least}, times).R[0].values
+    does_not = bubble_path("neo-hookean-kelvin-voigt", gel, times).R[0].values
+    assert np.max(np.abs(stiffens / does_not - 1)[times < times[int(np.argmax(does_not))]]) < 0.01
+
+
 @pytest.mark.parametrize("gel", [SOFT, STIFF], ids=["soft", "stiff"])
 def test_a_guessed_clock_is_as_exact_late_as_early(gel: dict[str, float]) -> None:
     early, late = (of_file(gel, zero) for zero in (134.26, 12345.26))
