@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
 from textwrap import fill
@@ -48,9 +48,8 @@ def front(designs: Designs) -> list[DesignRow]:
     return kept
 
 
-def settings_text(row: DesignRow, shown: Callable[[str], str] = str) -> str:
-    """The value of each knob; ``shown``: how a page or a figure writes one."""
-    return ", ".join(f"{name} {shown(str(value))}" for name, value in row.settings.items()) or "as in the file"
+def settings_text(row: DesignRow) -> str:
+    return ", ".join(f"{name} {with_pretty_unit(str(it))}" for name, it in row.settings.items()) or "as in the file"
 
 
 def with_pretty_unit(value: str) -> str:
@@ -218,7 +217,7 @@ def fans(designs: Designs) -> Chart:
         low, lower, middle, upper, high = convert(result.fan, *value)
         worth = [(f"{it.worth:.2f} nats", it.alike) for it in (result, *(other.evaluated for other in others))]
         told = [f"{nats} of {counted(alike, 'experiment')}" if several else nats for nats, alike in worth]
-        settings = settings_text(row, lambda value: figure_text(with_pretty_unit(value)))
+        settings = ", ".join(map(figure_text, settings_text(row).split(", ")))
         title = fill(f"{settings}: {', '.join(told)}", WIDE)
         panel = Panel(with_unit("time", time[1]), with_unit(designs.asked.seen, value[1]), title=title)
         panel.band(t, low, high, "posterior", 0.18)
@@ -248,11 +247,8 @@ def write_design(folder: Path) -> Path:
         "design",
         designs=designs,
         by=by,
-        rows=[(settings_text(row, with_pretty_unit), row, words(designs, row), row in best) for row in rows],
-        lab=[
-            (settings_text(row, with_pretty_unit), readings_text(designs, row), row, of)
-            for row, of in zip(best, told, strict=True)
-        ],
+        rows=[(settings_text(row), row, words(designs, row), row in best) for row in rows],
+        lab=[(settings_text(row), readings_text(designs, row), row, of) for row, of in zip(best, told, strict=True)],
         remarks=remarks(designs),
         drawings=draw(figures),
     )

@@ -293,7 +293,7 @@ def test_units_of_knobs_on_the_page_are_as_of_all_figures(tmp_path):
     assert panel.xlabel == "every (µs)"
     page = (directory / "design.html").read_text(encoding="utf-8")
     assert "every 400000 µs" in page
-    assert "every 400000 us" in design_table(found)
+    assert "every 400000 µs" in design_table(found)
     assert " us<" not in page
     assert with_pretty_unit("neo-hookean") == "neo-hookean"
     assert with_pretty_unit("0.3") == "0.3"
