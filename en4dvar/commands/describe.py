@@ -9,7 +9,7 @@ from en4dvar.config import Config
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
 from en4dvar.model.state import Parameter
-from en4dvar.plumbing.hints import rounded
+from en4dvar.plumbing.hints import counted, rounded
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
@@ -27,8 +27,9 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     cells = sum(prior.field.size for prior in first.fields)
     and_cells = f" and {cells} cells of fields" if cells else ""
     parts = [
-        f"{config.name}: {len(first.prior.names)} parameters{and_cells} from {len(problems)} data set(s) with "
-        f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
+        f"{config.name}: {counted(len(first.prior.names), 'parameter')}{and_cells} from "
+        f"{counted(len(problems), 'data set')} with {settings.scheme}, {counted(settings.members, 'member')}, "
+        f"weights {config.weights}, seed {config.seed}",
         table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
     parts.append(_together(problems, ("estimated", "unit", "prior", "median", "5 %", "95 %"), _prior_rows))

@@ -74,7 +74,7 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     from en4dvar.executor import available_cores
     from en4dvar.runs.engine import write_report
 
-    echo(f"report: {write_report(run_dir, datasets, available_cores(), figures)}")
+    echo(f"report: {run_dir / write_report(run_dir, datasets, available_cores(), figures).name}")
 
 
 @click.command()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, not_empty, workers_option
+from en4dvar.plumbing.hints import counted
 
 if TYPE_CHECKING:
     from en4dvar.config import SequenceConfig, TwinConfig
@@ -245,7 +246,8 @@ def validate(source: Source, plot: bool) -> None:
     for shown in previews:
         _warn(shown)
     if unusable:
-        echo(f"warning: a run goes on with {len(problems)} data set(s), without those that cannot be used:", err=True)
+        left = counted(len(problems), "data set")
+        echo(f"warning: a run goes on with {left}, without those that cannot be used:", err=True)
     for fault in unusable:
         echo(str(fault), err=True)
     if plot:

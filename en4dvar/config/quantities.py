@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Literal
 
-from en4dvar.config.context import Context, Made
+from en4dvar.config.context import Context, Made, Unknown
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit, split_quantity
@@ -68,8 +68,12 @@ def unit_of(target: Unit) -> Made:
     """The text of a unit that can be converted to ``target``."""
 
     def fits(unit: str, context: Context) -> str:
-        parse_unit(unit)  # also where what it is converted to is not known
-        convert(1.0, unit, target(context))
+        try:
+            wanted = target(context)
+        except Unknown:
+            parse_unit(unit)  # is a unit, at least
+            raise
+        convert(1.0, unit, wanted)
         return unit
 
     return Made(fits, str)

@@ -24,6 +24,7 @@ from en4dvar.ensemble.linalg import LowRank
 from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.plumbing.hints import counted
 from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.asked import is_done, linearised, members_of, step_of
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression
@@ -284,7 +285,7 @@ class DataWindow(Objective[Descent]):
         assert taken is not None
         count = descent.iteration
         if is_done(self.scheme, count - 1, taken):
-            descent.stop = f"{count} assimilation{'s' * (count > 1)}"
+            descent.stop = counted(count, "assimilation")
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
         descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.dense)
 

@@ -13,6 +13,7 @@ from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.varying import RandomWalk
@@ -98,7 +99,7 @@ class Descents:
         parts += [f"{self.costs[n]:.6g} from {_members(of[n])}" for n in sorted(of) if n > 0]
         if -1 in of:
             parts.append(f"no minimum from {_members(of[-1])}")
-        return f"{len(self.members)} descent{'s' * (len(self.members) > 1)} ended at {', '.join(parts)}"
+        return f"{counted(len(self.members), 'descent')} ended at {', '.join(parts)}"
 
 
 def _members(numbers: Sequence[int]) -> str:

@@ -29,6 +29,7 @@ from en4dvar.estimation import conclusions
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError, TooFewMembersError
+from en4dvar.plumbing.hints import counted
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.local_gain import ByDistance
@@ -136,7 +137,7 @@ class Localised:
             raise TooFewMembersError(f"{observations.name}: {error}. Most frequent reasons: {reasons}") from None
         for i in set(self.everyone.tolist()) - set(passes.alive.tolist()):
             lost[i] = prior_run.failures[i] or f"failed in a pass of {settings.scheme}"
-        return mean_of(ensemble, passes.alive), True, f"{len(inflations)} assimilations", lost
+        return mean_of(ensemble, passes.alive), True, counted(len(inflations), "assimilation"), lost
 
     def _predict(self, members: Array) -> Array:
         run = self.forecast(members)

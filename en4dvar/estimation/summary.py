@@ -17,12 +17,14 @@ from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift, exclusion, is_manifold
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
 
 MOST_REMARKS = 3
 MOST_BRIEF = 4  # parameters in one line
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
+ROUNDING = 1e-12  # of the std: what is left of the mean of members that are centred at 0
 LITTLE, AS_WIDE = "data say little", "not narrowed by the data"
 MODAL = "of several modes: quantiles, no mean ± std"
 DFS_WORDS = (
@@ -111,8 +113,8 @@ def remarks(a: Analysis) -> tuple[str, ...]:
         lines.insert(0, f"after the window: {share:.0%} of {count} readings lie in their 90 % bands")
     known = [name for name in a.problem.model.path_parameters if name in a.problem.prior.names]
     if a.settings.what_if == "added":
-        count = sum(shift.settled for shift in a.what_if)
-        lines.insert(0, f"the intervals contain {count} rows of the what-if table, each as one standard deviation")
+        rows = counted(sum(shift.settled for shift in a.what_if), "row")
+        lines.insert(0, f"the intervals contain {rows} of the what-if table, each as one standard deviation")
     lines[:0] = [words for name in known if (words := budget_words(a, name))]
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 
@@ -243,4 +245,5 @@ def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> "pd.DataFrame"
 def _moments(values: Array) -> tuple[float, float]:
     if values.size < 2:
         return (float(values[0]) if values.size else np.nan), np.nan
-    return float(values.mean()), float(values.std(ddof=1))
+    mean, std = float(values.mean()), float(values.std(ddof=1))
+    return (0.0 if abs(mean) < ROUNDING * std else mean), std

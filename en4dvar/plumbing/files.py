@@ -258,6 +258,13 @@ def expanded(text: str) -> Path:
         raise PathError(f"{text}: the home folder that ~ stands for is not known") from None
 
 
+def path_from(folder: Path, data: str) -> str:
+    """``data`` as a configuration in ``folder`` says it: relative where both share more than the root."""
+    path, here = expanded(data).absolute(), folder.absolute()
+    near = path.parts[:2] == here.parts[:2] and len(here.parts) > 1
+    return Path(os.path.relpath(path, here)).as_posix() if near else path.as_posix()
+
+
 def here() -> str:
     """The working directory, "" where it is gone."""
     try:

@@ -47,6 +47,15 @@ def suggest(word: object, known: Iterable[str] | Mapping[str, object]) -> str:
     return f"; known: {', '.join(names)}" if names else ""
 
 
+def counted(number: float, thing: str) -> str:
+    """How many of a thing there are.
+
+    >>> counted(1, "data set"), counted(0, "iteration"), counted(12.0, "reading")
+    ('1 data set', '0 iterations', '12 readings')
+    """
+    return f"{number:.0f} {thing}{'s' * (round(number) != 1)}"
+
+
 def rounded(*counts: float) -> str:
     """Counts to two digits, from the least to the most.
 

@@ -90,7 +90,7 @@ _TOKEN = re.compile(
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
 
-def _symbol(name: str) -> Unit:
+def _symbol(name: str, like: str = "") -> Unit:
     if name in UNPREFIXED:
         return UNPREFIXED[name]
     if name in PREFIXED:
@@ -98,26 +98,34 @@ def _symbol(name: str) -> Unit:
     if name[:1] in PREFIXES and name[1:] in PREFIXED:
         scale = Unit(Fraction(10) ** PREFIXES[name[0]], ONE.powers)
         return scale * PREFIXED[name[1:]]
-    raise UnitError(f"unknown unit {name!r}{_did_you_mean(name)}")
+    raise UnitError(f"unknown unit {name!r}{_did_you_mean(name, like)}")
 
 
-def _did_you_mean(name: str) -> str:
+def _did_you_mean(name: str, like: str) -> str:
+    """The units that differ in capitals alone, which may be 10⁹ apart, else the nearest; none of another
+    dimension than ``like``, where this is known.
+    """
     words = {"micron": "um", "sec": "s", "usec": "us", "msec": "ms", "hz": "Hz", "degC": "K", "C": "K", "percent": "%",
              "hour": "h", "hr": "h", "minute": "min", "second": "s", "a": "yr", "month": "d"}  # fmt: skip
     single = name.removesuffix("s")
-    known = [*UNPREFIXED, *PREFIXED, *(p + u for p in PREFIXES for u in PREFIXED)]
+    every = [*UNPREFIXED, *PREFIXED, *(p + u for p in PREFIXES for u in PREFIXED)]
+    known = [k for k in every if not like or _symbol(k).powers == parse_unit(like).powers]
     same_letters = [k for k in known if k.lower() == name.lower()]
-    close = [words[single]] if single in words else same_letters[:1] or get_close_matches(name, known, 1, 0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    word = [words[single]] if words.get(single) in known else []
+    close = word or same_letters or get_close_matches(name, known, 1, 0.6)
+    if not close:
+        return f"; it has to be one such as {like!r}" if like not in ("", "1") else ""
+    return f"; did you mean {' or '.join(map(repr, close))}?"
 
 
 @lru_cache(maxsize=1024)
-def parse_unit(text: str) -> Unit:
+def parse_unit(text: str, like: str = "") -> Unit:
     """The unit written as ``text``: ``"Pa s"``, ``"W/(m K^2)"``, ``"1/us"``, ``"m s-1"``, ``"s^0.6"``, ``"%"``.
 
     ``"2.76*um"`` is a unit as well, such as a pixel, and ``"1/(270*kHz)"``, the time between two frames.
 
-    A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`.
+    A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`, which proposes nothing
+    of another dimension than the unit ``like``.
     """
     if not isinstance(text, str):
         raise UnitError(f"a unit is a text such as 'm/s', not {text!r}")
@@ -132,7 +140,7 @@ def parse_unit(text: str) -> Unit:
         multiple = re.fullmatch(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([A-Za-z%(].*)", clean)
         hint = f"; a multiple of a unit has a star: '{multiple[1]}*{multiple[2]}'" if multiple else ""
         raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}{hint}")
-    unit = _product(iter(tokens), text)
+    unit = _product(iter(tokens), text, like=like if len(tokens) == 1 else "")
     if not 1e-90 < unit.factor < 1e90:
         raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")
     return unit
@@ -160,7 +168,7 @@ def as_unit(quantity: str, unit: str) -> str:
     return f"{number.lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
 
 
-def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "") -> Unit:
+def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "", like: str = "") -> Unit:
     """Factors up to the ``closing`` bracket, or else the end."""
     unit, operator, divided = ONE, "", False
     expects_factor, end = True, ""
@@ -184,7 +192,7 @@ def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "") -> U
             power = token["power"] or "1"
             if len(power) > (7 if "." in power else 3) or abs(Fraction(power)) > LARGEST_POWER:
                 raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
-            factor = _symbol(token["symbol"]) ** Fraction(power)
+            factor = _symbol(token["symbol"], like if power == "1" else "") ** Fraction(power)
         if divided and operator != "/":
             raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
         divided = divided or operator == "/"
@@ -199,7 +207,7 @@ def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "") -> U
 
 @lru_cache(maxsize=1024)
 def _factor(from_unit: str, to_unit: str) -> Fraction:
-    source, target = parse_unit(from_unit), parse_unit(to_unit)
+    source, target = parse_unit(from_unit, to_unit), parse_unit(to_unit)
     if source.powers != target.powers:
         raise UnitError(f"unit {from_unit!r} cannot be converted to {to_unit!r}")
     return source.factor / target.factor

@@ -129,11 +129,11 @@ def _headlines(run_dir: Path) -> list[Headline]:
     elif groups is not None:
         populations.write_tables(groups, run_dir)
         drawn = svg(populations.figure(groups), "populations", groups.caption)
-        told = [*populations.group_sentences(groups)]
+        told = [*populations.group_sentences(groups, groups.symbols)]
         headlines.append(("differences.csv", "The differences", told, drawn, groups.caption, ()))
     for name, (folder, of) in populations_of(run_dir).items():
-        words = f"The population of {name}" if name else "The population behind them"
-        told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of)]
+        words = f"The population of {name}" if name else "The population of all data sets"
+        told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of, of.symbols)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
         headlines.append((address, words, told, together.population_figure(of), together.caption(of), of.cautions))
     if (run_dir / JOINT).exists():

@@ -58,7 +58,7 @@ class Panel:
     """Two axes and what is drawn between them.
 
     ``xticks``, ``yticks``: how many intervals at most, or the ticks themselves; ``names``, ``y_names``: words in place
-    of their numbers. A ``title`` may have several lines. ``bare``: nothing but ``words``, in the middle. Limits
+    of their numbers. A ``title`` may have several lines. ``bare``: no axes, and ``words`` in the middle. Limits
     that are None follow the marks.
     """
 

@@ -149,7 +149,7 @@ class Comparison:
             return f"not compared: {without}"
         best, second = sorted(known, key=lambda score: -score.log_evidence)[:2]
         words = preferred(best.run, second.run, -second.difference) + f"; {without}" * bool(without)
-        if doubts := [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]:
+        if doubts := [f"{score.run} ({score.doubted.replace(' ', ', ')})" for score in (best, second) if score.doubted]:
             words += f"; not to be trusted before the warnings of {' and '.join(doubts)} are settled"
         return words
 
@@ -228,7 +228,7 @@ def comparison_table(comparison: Comparison) -> str:
     ]  # fmt: skip
     told = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     verdicts = [comparison.verdict("")] if comparison.incomparable else told
-    notes = [STORED] if any(s.stored for s in comparison.scores) and not comparison.incomparable else []
+    notes = [STORED] if any(s.stored for s in comparison.scores) else []
     warned = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in comparison.cautions]
     if (more := len(warned) - MOST_WARNINGS) > 0:
         warned[MOST_WARNINGS:] = [f"and {more} more warnings and notes; see the report"]

@@ -13,12 +13,13 @@ import numpy as np
 from en4dvar.estimation.design.evaluate import Evaluated
 from en4dvar.estimation.design.nested import THIN, Decision
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import table, write_csv
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.svg import draw
-from en4dvar.report.text import figure_text, rough_number, with_unit
+from en4dvar.report.text import figure_text, pretty_unit, rough_number, unit_behind, with_unit
 from en4dvar.results.design_file import DECISION, FILE, DesignRow, Designs, load_designs
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
@@ -48,7 +49,14 @@ def front(designs: Designs) -> list[DesignRow]:
 
 
 def settings_text(row: DesignRow) -> str:
-    return ", ".join(f"{name} {value}" for name, value in row.settings.items()) or "as in the file"
+    return ", ".join(f"{name} {with_pretty_unit(str(it))}" for name, it in row.settings.items()) or "as in the file"
+
+
+def with_pretty_unit(value: str) -> str:
+    """``"1.4 us"`` → ``"1.4 µs"``; what is no number with a unit stays as it is."""
+    number = NUMBER.match(value)
+    unit = value[number.end() :] if number else ""
+    return f"{value[: -len(unit)]}{pretty_unit(unit)}" if unit and is_unit(unit) else value
 
 
 def words(designs: Designs, row: DesignRow) -> str:
@@ -74,7 +82,7 @@ def _spread(std: float, relative: float, unit: str, shown: str) -> str:
     """In % of the value where that says something, else in the unit shown."""
     if relative < COARSE:
         return f"{rough_number(100 * relative)} %"
-    return f"{rough_number(convert(std, unit, shown))} {shown}".removesuffix(" 1")
+    return f"{rough_number(convert(std, unit, shown))}{unit_behind(shown)}"
 
 
 def needs(designs: Designs, row: DesignRow) -> list[str]:
@@ -126,7 +134,7 @@ def design_table(designs: Designs) -> str:
     ]  # fmt: skip
     wanted = []
     for row in dict.fromkeys([*rows[:1], *own]):
-        alike = f"; {row.evaluated.alike} experiment{'s' * (row.evaluated.alike > 1)}" if several else ""
+        alike = f"; {counted(row.evaluated.alike, 'experiment')}" if several else ""
         wanted += [f"{settings_text(row)}{alike}: {text}" for text in needs(designs, row)]
     return "\n".join([table([head, *cells]), *wanted])
 
@@ -147,10 +155,10 @@ def remarks(designs: Designs) -> list[str]:
     stands = sum(it.thin > THIN and it.method != "nested" for it in worth)
     thin = sum(max(it.thin, it.decision.thin if it.decision else 0.0) > THIN for it in worth) - stands
     if thin:
-        told.append(f"of {thin} designs the evidences of many readings are rough; raise design.inner")
+        told.append(f"of {counted(thin, 'design')} the evidences of many readings are rough; raise design.inner")
     if stands:
         few = "too few draws check the linearised information, which stands; raise design.inner"
-        told.append(f"of {stands} designs {few}")
+        told.append(f"of {counted(stands, 'design')} {few}")
     told += [
         f"{settings_text(row)}: {row.evaluated.alike} of these experiments (by {by(row.evaluated)}) cannot tell more "
         f"than {more.evaluated.alike} (by {by(more.evaluated)}): the two are not comparable; set design.method: laplace"
@@ -175,7 +183,7 @@ def gains(designs: Designs) -> Chart:
         x, labels, unit = _positions([row.settings.get(name, row.evaluated.alike) for row in rows])
         worth = np.array([row.evaluated.worth for row in rows])
         errors = np.array([row.evaluated.worth_error for row in rows])
-        panel = Panel(figure_text(name) + unit, "information [nats]", names=labels)
+        panel = Panel(with_unit(figure_text(name), unit), "information (nats)", names=labels)
         if labels:
             panel.xticks = range(len(labels))
         panel.bars(x, worth - errors, worth + errors, "posterior", 0.6, 0.7)
@@ -186,7 +194,7 @@ def gains(designs: Designs) -> Chart:
 
 
 def prices(designs: Designs) -> Chart:
-    panel = Panel("price", "information [nats]")
+    panel = Panel("price", "information (nats)")
     (x, y), (u, v) = (np.array([(row.price, row.evaluated.worth) for row in of(designs)]).T for of in (ranked, front))
     panel.dots(x, y, "prior", 3.0)
     panel.line(u, v, "posterior")
@@ -208,8 +216,8 @@ def fans(designs: Designs) -> Chart:
         t, taken = convert(result.grid, *time), convert(result.times, *time)
         low, lower, middle, upper, high = convert(result.fan, *value)
         worth = [(f"{it.worth:.2f} nats", it.alike) for it in (result, *(other.evaluated for other in others))]
-        told = [f"{nats} of {alike} experiment{'s' * (alike > 1)}" if several else nats for nats, alike in worth]
-        settings = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
+        told = [f"{nats} of {counted(alike, 'experiment')}" if several else nats for nats, alike in worth]
+        settings = ", ".join(map(figure_text, settings_text(row).split(", ")))
         title = fill(f"{settings}: {', '.join(told)}", WIDE)
         panel = Panel(with_unit("time", time[1]), with_unit(designs.asked.seen, value[1]), title=title)
         panel.band(t, low, high, "posterior", 0.18)
@@ -249,7 +257,7 @@ def write_design(folder: Path) -> Path:
 def readings_text(designs: Designs, row: DesignRow) -> str:
     """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
     stored, shown = designs.asked.axes[0]
-    count, unit = len(row.evaluated.times), f" {shown}".removesuffix(" 1")
+    count, unit = len(row.evaluated.times), unit_behind(shown)
     t = np.unique(convert(row.evaluated.times, stored, shown))
     gaps = np.diff(t)
     if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
@@ -278,12 +286,11 @@ def _cells(designs: Designs) -> list[list[Any]]:
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str], str]:
-    """Where a knob's values lie on an axis, at numbers of one unit or side by side; labels; the unit in brackets."""
+    """Where a knob's values lie on an axis, at numbers of one unit or side by side; labels; the unit."""
     texts = list(map(str, values))
     numbers = [match for match in map(NUMBER.match, texts) if match]
     units = {match.string[match.end() :] for match in numbers}
     if len(numbers) == len(texts) and len(units) == 1:
-        unit = units.pop()
-        return np.array([float(match[1]) for match in numbers]), [], f" [{unit}]" if unit else ""
+        return np.array([float(match[1]) for match in numbers]), [], units.pop() or "1"
     names = list(dict.fromkeys(texts))
-    return np.array([names.index(text) for text in texts], dtype=float), names, ""
+    return np.array([names.index(text) for text in texts], dtype=float), names, "1"

@@ -129,7 +129,7 @@ def traces(result: StoredResult) -> Chart:
 
 
 def pairs(result: StoredResult) -> Chart:
-    """Posterior members of every pair of parameters; above the diagonal their correlation."""
+    """Posterior members of every pair of parameters; above the diagonal their correlation, on its colour."""
     rows = result.rows
     side = max(COLUMN, min(PAGE, len(rows) * 2.7 * POINTS))
     values = {row.name: result.members("posterior", row.name) for row in rows}
@@ -261,6 +261,8 @@ def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
         known = np.ptp(x) > 0 and np.ptp(y) > 0
         correlation = float(np.corrcoef(x, y)[0, 1]) if known else math.nan
         panel.bare, panel.words = True, f"{correlation:+z.2f}".replace("-", "−") if known else "–"
+        panel.ylim = 0.0, 1.0
+        panel.span(0.0, 1.0, "centre" if correlation < 0 else "posterior", 0.6 * abs(correlation) if known else 0.0)
     return panel
 
 
@@ -369,7 +371,9 @@ FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredRe
      lambda result: np.isfinite(result.group("iterations")["J"].values).any(), cost),
     ("iterations", "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",
      lambda result: result.parameters, traces),
-    ("pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.",
+    ("pairs",
+     "Posterior members in pairs of parameters. Above the diagonal their correlation, the stronger the deeper its "
+     "colour (blue: positive, orange: negative).",
      lambda result: 2 <= len(result.parameters) <= MAX_PAIRS and result.alive.sum() > 2, pairs),
 )  # fmt: skip
 

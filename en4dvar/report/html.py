@@ -11,13 +11,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.hints import counted
 from en4dvar.report import responses, text
 from en4dvar.report.chart import DARK, LIGHT
 
 WRITERS = (  # what templates call
-    text.display_unit, text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
-    text.pretty_unit, text.quantity, text.range_words, text.rough_number, text.shown, text.symbol_html,
-    text.untrusted_words, responses.sentence, responses.shift_text,
+    text.display_unit, text.estimate, text.fixed, text.in_powers, text.number_like, text.percent, text.plain_number,
+    text.plus_minus, text.pretty_unit, text.quantity, text.range_words, text.rough_number, text.shown, text.symbol_html,
+    text.untrusted_words, responses.sentence, responses.shift_text, counted,
 )  # fmt: skip
 
 
@@ -43,7 +44,8 @@ def render(template: str, package: str = "en4dvar.report", /, **content: Any) ->
 def _environment(package: str) -> Environment:
     environment = Environment(loader=PackageLoader(package, "."), autoescape=True, undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
-    environment.filters["upper_first"] = text.upper_first
+    environment.filters |= {"upper_first": text.upper_first, "with_symbols": text.with_symbols}
+    environment.filters["without_folders"] = text.without_folders
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"

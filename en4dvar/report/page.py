@@ -82,6 +82,7 @@ def trust(result: StoredResult) -> str:
         return ""
     size, _ = judge_chi2(float(stats["chi2_per_observation"]), int(stats["n_weighted"]), float(stats["dfs"]))
     words = f"No warnings: the {size.partition(';')[0]}{_neighbours_words(result)}."
+    words += "".join(f" But {c.words}." for c in worst if c.code == "down-weighted")
     if moved := len(exceeding(stored_shifts(result))):
         which = "one assumption matters" if moved == 1 else f"{moved} assumptions matter"
         words += f" The numbers hold for what was assumed: {which} by more than an error bar, see below."

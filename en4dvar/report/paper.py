@@ -81,6 +81,9 @@ def save_chart(chart: Chart, folder: Path, name: str) -> None:
 
 def _panel(ax: Axes, panel: Panel) -> None:
     if panel.bare:
+        for mark in panel.marks:
+            _mark(ax, mark)
+        ax.set(ylim=panel.limits()[1])
         ax.set_axis_off()
         ax.text(0.5, 0.5, panel.words, ha="center", va="center", transform=ax.transAxes)
         return

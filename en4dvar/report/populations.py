@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
+from en4dvar.report.together import NAMES
 from en4dvar.results.netcdf import understood
 from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
 
@@ -76,7 +77,7 @@ class PopulationsCompared:
     line of them, of their logarithm where it is in ``logarithmic``, against a number of each population; ``quoted``:
     5, 50 and 95 % (3, K) of the median of each population by itself, or, where ``calibrated`` by what is known of some
     of them, of ``medians``; ``doubted``: the populations in which it is not to be trusted. ``common``: quantities with
-    one value in several populations; ``notes``: what else has to be known.
+    one value in several populations; ``notes``: what else has to be known; ``symbols``: how a page writes the names.
     """
 
     populations: tuple[str, ...]
@@ -90,6 +91,7 @@ class PopulationsCompared:
     logarithmic: frozenset[str] = frozenset()
     calibrated: bool = False
     doubted: Mapping[str, Collection[str]] = field(default_factory=dict)
+    symbols: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -174,7 +176,7 @@ def compare_populations(
     doubted = {name: [label for label, s in stored.items() if untrusted(s.cautions, name)] for name in names}
     return PopulationsCompared(
         tuple(stored), parameters, medians, quoted, tuple(differences), common, tuple(notes), lines, logarithmic,
-        calibrated, doubted,
+        calibrated, doubted, dict(chain.from_iterable(s.symbols.items() for s in stored.values())),
     )  # fmt: skip
 
 
@@ -298,20 +300,25 @@ def _common(s: StoredPopulation, apart: Sequence[str], label: str) -> tuple[tupl
     return tuple((name, label if name in apart else prior) for name, prior in priors.items())
 
 
-def sentences(c: PopulationsCompared) -> Iterator[str]:
-    """The answer: one sentence a pair and parameter, one a line, and what is taken to be common."""
+def sentences(c: PopulationsCompared, called: Mapping[str, str] = NAMES) -> Iterator[str]:
+    """The answer: one sentence a pair and parameter, one a line, and what is taken to be common; ``called``: how a page
+    writes the names of parameters.
+    """
     for d in c.differences:
-        yield _sentence(d)
+        yield _sentence(replace(d, parameter=called.get(d.parameter, d.parameter)))
     for name, of_it in c.lines.items():
-        yield _line_sentence(c, name, of_it)
+        yield _line_sentence(c, name, of_it, called.get(name, name))
     if c.common:
-        yield f"These have one value in all of them and cancel as far as they move all alike: {', '.join(c.common)}."
+        names = ", ".join(called.get(name, name) for name in c.common)
+        yield f"These have one value in all of them and cancel as far as they move all alike: {names}."
     if not c.calibrated:
         yield (
             "For a single population quote its own median. Ratios and differences use all data, without the pull "
             "of the hyperpriors on the medians unless a note says so; they need not be those of the single medians."
         )
-    yield from (f"{note}." for note in c.notes)
+    for note in c.notes:
+        name = re.split("[ :]", note, maxsplit=1)[0]  # most notes begin with the parameter that they are about
+        yield f"{called.get(name, name)}{note.removeprefix(name)}."
 
 
 def _sentence(d: Difference) -> str:
@@ -330,12 +337,12 @@ def _sentence(d: Difference) -> str:
     return f"{words}; not to be trusted: {d.untrusted.replace(' ', ', ')}." if d.untrusted else f"{words}."
 
 
-def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
+def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine, called: str) -> str:
     unit = unit_behind(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
     rising = float(np.mean(of_it.slope > 0))
     by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)}{unit}"
-    words = f"{name} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
+    words = f"{called} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
         return f"{words}; they do not lie on a line (χ² {chi} of {of_it.freedom}), for which the interval is widened."
@@ -382,7 +389,7 @@ def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     out = make_folder(out)
     ((_, _, drawn),) = draw([("populations", c.caption, figure(c))], folder=out)
     write_tables(c, out)
-    title, told = " – ".join(c.populations), tuple(sentences(c))
+    title, told = " – ".join(c.populations), tuple(sentences(c, c.symbols))
     return write_page(out, "compare", title=title, populations=told, figure=drawn, caption=c.caption)
 
 
@@ -426,9 +433,9 @@ def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
         return f"The groups are not compared: {error}."
 
 
-def group_sentences(of: PopulationsCompared) -> Iterator[str]:
+def group_sentences(of: PopulationsCompared, called: Mapping[str, str] = NAMES) -> Iterator[str]:
     """The answer, and which number the straight line is of."""
-    yield from sentences(of)
+    yield from sentences(of, called)
     if of.lines:
         yield f"The number of the straight line is that of the names of the groups, in {numbers_of(of.populations)[1]}."
 

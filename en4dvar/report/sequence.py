@@ -8,6 +8,7 @@ model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ from scipy.stats import binom
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, write_text
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, interval, stacked
@@ -30,7 +32,7 @@ from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_m
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import axis_label, fixed, percent, plain_number, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, fixed, number_like, percent, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import MEAN, estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
@@ -154,7 +156,7 @@ class SequenceOutcome(SeriesResult):
     def __repr__(self) -> str:
         told = [f"{name} {mean:.4g} ± {std:.2g} {unit}".removesuffix(" 1") for name, mean, std, unit in estimates(self)]
         more = f" and {len(told) - MOST} more" if len(told) > MOST else ""
-        about = f"{self.problem.name}, {len(self.problem.series.times)} times"
+        about = f"{self.problem.name}, {counted(len(self.problem.series.times), 'time')}"
         return f"<SequenceOutcome {about}; at the end {', '.join(told[:MOST])}{more}>"
 
     def __str__(self) -> str:
@@ -179,7 +181,7 @@ class SequenceOutcome(SeriesResult):
 
 def _ended(data: Group) -> dict[str, Any]:
     at_end = [
-        (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
+        (name, number_like(mean, std), number_like(std, std), pretty_unit(unit))
         for name, mean, std, unit in islice(last_analysis(data), LISTED)
     ]
     rows = []
@@ -326,6 +328,7 @@ def _same(first: Group, other: Group, key: str) -> bool:
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
 FEW = 4  # variables of the state in the second figure
 LAST = 200  # cycles in it
+BLOCKS = 20  # of times, whose averages tell how sure that of all is
 MOST_BARS = 21  # of the histogram of the truth's rank
 GROUPS = 12  # of spreads
 
@@ -336,7 +339,7 @@ class TwinOutcome(TwinResult):
     def __repr__(self) -> str:
         own = self.experiment
         told = [f"{name} RMSE {s.mean_rmse:.3g}, spread {s.mean_spread:.3g}" for name, s in self.scores.items()]
-        return f"<TwinOutcome: {own.members} members, {own.cycles} cycles; {'; '.join(told)}>"
+        return f"<TwinOutcome: {counted(own.members, 'member')}, {counted(own.cycles, 'cycle')}; {'; '.join(told)}>"
 
     def __str__(self) -> str:
         return "\n".join([self.table(), *(f"warning: {words}" for words in self.warnings)])
@@ -362,10 +365,21 @@ def _scored(data: Group) -> dict[str, Any]:
     burn_in = int(data.attrs["burn_in"])
     rows = []  # estimate, RMSE, spread, spread over RMSE after the burn-in
     for kind, _ in _kinds(data):
-        rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
-        rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
+        (rmse, off), (spread, by) = (averaged(data, f"{kind}_{what}") for what in ("rmse", "spread"))
+        ratio, share = spread / rmse, math.hypot(off / rmse, by / spread)
+        rows.append((kind, number_like(rmse, off), number_like(spread, by), number_like(ratio, ratio * share)))
     heads = with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data))
     return {"iterations": float(data["iterations"].values[burn_in:].mean()), "heads": heads, "scores": rows}
+
+
+def averaged(data: Group, name: str) -> tuple[float, float]:
+    """A score's average after the burn-in, and how far chance moves it: by the averages of :data:`BLOCKS` times, for
+    scores of cycles that follow each other are alike. Of one cycle a tenth of itself.
+    """
+    values, mean = data[name].values[int(data.attrs["burn_in"]) :], float(data[name].attrs[MEAN])
+    there = values[np.isfinite(values)]
+    averages = [block.mean() for block in np.array_split(there, min(BLOCKS, len(there)))] if len(there) > 1 else []
+    return mean, float(np.std(averages, ddof=1) / math.sqrt(len(averages))) if averages else 0.1 * mean
 
 
 def twin_figures(data: Group) -> Iterator[Captioned]:
@@ -387,8 +401,8 @@ def scores(data: Group) -> Chart:
     time, panels = data["time"].values, []
     for kind, colour in _kinds(data):
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
-        average, top = float(rmse.attrs[MEAN]), _upper(np.concatenate([rmse.values, spread.values]))
-        title = f"{kind}: RMSE {plain_number(average, 3)}"
+        (average, off), top = averaged(data, f"{kind}_rmse"), _upper(np.concatenate([rmse.values, spread.values]))
+        title = f"{kind}: RMSE {number_like(average, off)}"
         panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=span_of(time), ylim=(0.0, top))
         if burn_in := int(data.attrs["burn_in"]):
             panel.band(time[[0, burn_in - 1]], [0, 0], [top, top], "grid", 0.5)

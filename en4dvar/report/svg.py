@@ -104,11 +104,12 @@ def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str
     below = max((_below(p) for p in row.panels), default=0.0)
     height = row.height - above - below
     place = Frame(x, top + above, width, height, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
+    drawn = "".join(path_of(mark, place) for mark in panel.marks)
     if panel.bare:
-        return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
+        words = written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)
+        return [f'<g fill="none">{drawn}</g>', words] if panel.words else []
     lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(panel.y_ticks(), place.up))
     box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
-    drawn = "".join(path_of(mark, place) for mark in panel.marks)
     (x0, x1), (y0, y1) = place.xlim, place.ylim
     scales = f"{' data-log' * panel.logarithmic}{' data-xlog' * panel.x_logarithmic}"
     reading = f'data-x="{x0:.7g} {x1:.7g}" data-y="{y0:.7g} {y1:.7g}"{scales}'

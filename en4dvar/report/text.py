@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from en4dvar.results.netcdf import Variable
 
+VALUES = ("prior_mean", "prior_std", "mean", "std", "q05", "q50", "q95", "centre")  # of a parameter, in its unit
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (
     "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty ell "
@@ -108,9 +110,36 @@ def range_words(low: float, high: float, std: float, unit: str = "1") -> str:
     return f"{number_like(low, std)} … {quantity(high, std, unit)}"
 
 
+def power_of(mean: float, std: float) -> int:
+    """The power of ten, a multiple of three, to write both with where :func:`number_like` needs one: 0 of usual sizes.
+
+    >>> power_of(6.041e-9, 1.239e-10), power_of(2.8, 0.1), power_of(2.8, 1e-7)
+    (-9, 0, 0)
+    """
+    largest = max(abs(mean), std)
+    usual = (not 0 < std < 1e-5 and largest < 1e6) or not math.isfinite(largest)
+    return 0 if usual else 3 * math.floor(math.log10(largest) / 3)
+
+
 def plus_minus(mean: float, std: float) -> str:
-    """``"2.80 ± 0.10"``: the spread with two significant digits, the mean to the same decimals."""
+    """``"2.80 ± 0.10"``: the spread with two significant digits, the mean to the same decimals.
+
+    >>> plus_minus(6.041e-9, 1.239e-10)
+    '(6.04 ± 0.12)×10⁻⁹'
+    """
+    if power := power_of(mean, std):
+        return f"({plus_minus(mean / 10.0**power, std / 10.0**power)})×10{str(power).translate(_SUPERSCRIPT)}"
     return f"{number_like(mean, std)} ± {number_like(std, std)}"
+
+
+def in_powers(row: ParameterSummary) -> ParameterSummary:
+    """In its unit times a power of ten, where its numbers are far from 1: columns of them stay narrow."""
+    power = power_of(row.mean, row.std if math.isfinite(row.std) else row.prior_std)
+    if not power:
+        return row
+    numbers = {name: getattr(row, name) / 10.0**power for name in VALUES}
+    unit = "" if row.unit == "1" else row.unit
+    return replace(row, **numbers, unit=f"10{str(power).translate(_SUPERSCRIPT)} {unit}".strip())
 
 
 def estimate(row: ParameterSummary, mark: str = ", not to be trusted") -> str:
@@ -192,6 +221,24 @@ def symbol_html(symbol: str) -> Markup:
     tags = {"_": "sub", "^": "sup", "": "i"}
     pieces = ((tags[mark], piece) for mark, piece in math_pieces(symbol[1:-1]))
     return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) for tag, piece in pieces)
+
+
+def with_symbols(words: str) -> Markup:
+    r"""A sentence with mathtext symbols in it as HTML; everything else is escaped text.
+
+    >>> str(with_symbols(r"$\mu$ of a < b"))
+    '<i>μ</i> of a &lt; b'
+    """
+    return Markup("").join(symbol_html(part) for part in re.split(r"(\$[^$]+\$)", words))
+
+
+def without_folders(text: object) -> str:
+    """A text of a page, which others may see, without the folders of this machine that begin a path.
+
+    >>> without_folders("path: /home/me/data/x.csv"), without_folders("data/x.csv, W/(m K)")
+    ('path: …/x.csv', 'data/x.csv, W/(m K)')
+    """
+    return re.sub(r"(?<![^\s'\"])(?:[A-Za-z]:)?[\\/](?=[^\s\\/])(?:[^\\/\n'\",]+[\\/])+", "…/", str(text))
 
 
 def math_pieces(body: str) -> list[tuple[str, str]]:

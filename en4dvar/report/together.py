@@ -27,6 +27,7 @@ from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups,
 
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
+NAMES: Mapping[str, str] = {}  # of parameters: how a page writes them; else they are as in the configuration
 NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
 DOUBTED = "Orange, without an interval: not to be trusted, because of its warnings."
 SHARED = "Median and 5–95 % of the shared parameters, each data set alone (grey) and all{} together. " + DOUBTED
@@ -94,7 +95,7 @@ def joint_lines(joint: StoredJoint) -> list[str]:
     for e in (e for e in shared if not e.stated):
         without = f", one value in {count} data sets" + (f", without {e.without}" if e.without else "")
         doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else f"5–95 %: {_range(e)}"
-        lines.append(f"{e.label} {e.name} = {_median(e)} ({doubt}){without}")
+        lines.append(f"{e.label} {e.symbol} = {_median(e)} ({doubt}){without}")
     if stated := [e.label for e in shared if e.stated]:
         lines.append(f"the data add nothing to what was known before of: {', '.join(stated)}")
     return lines
@@ -218,32 +219,37 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
     return rows
 
 
-def sentences(stored: StoredPopulation) -> tuple[str, ...]:
-    """The answer: one sentence a parameter, and what the data determine together only."""
+def sentences(stored: StoredPopulation, called: Mapping[str, str] = NAMES) -> tuple[str, ...]:
+    """The answer: one sentence a parameter, and what the data determine together only; ``called``: how a page writes
+    the names of parameters.
+    """
     of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
     free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
     centres = of[stored.headline]
     lines = []
     for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
-        lines.append(_sentence(stored, centre, mean, spread))
+        lines.append(_sentence(stored, centre, mean, spread, called))
         if stored.common and not centre.untrusted:
             of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-            lines.append(_in_parts(stored, centre, of_it, centre.std))
-        lines += _compared(stored, centre)
+            lines.append(_in_parts(stored, centre, of_it, centre.std, called))
+        lines += _compared(stored, centre, called)
     odd = named(np.array([*stored.belongs.values()]), float(stored.tree.attrs.get("hyperprior_odd", 0)))
     if odd:
         names = ", ".join(stored.datasets[i] for i in odd)
         lines.append(f"Perhaps not of the population; these numbers count them only as far as they are: {names}.")
     if "empirical" in stored.tree.children:
-        checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
+        checked = [_of_sets(stored, centre, called) for centre in centres if not centre.untrusted]
         lines += [f"Check without a model of the population: {words}." for words in checked]
-    lines += [_together(stored, combination) for combination in stored.combinations]
+    lines += [_together(stored, combination, called) for combination in stored.combinations]
     if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
         words = f"the data leave {stored.headline} or spread open, or lie in its tail"
         free = f"The result without the hyperprior of {stored.headline} and spread is not known: {words}."
     else:
         each = zip(free_of[stored.headline], free_of["between"], strict=True)
-        ranges = "; ".join(f"{centre.name} {_range(centre)}, spread {_range(spread)}" for centre, spread in each)
+        ranges = "; ".join(
+            f"{called.get(centre.name, centre.name)} {_range(centre)}, spread {_range(spread)}"
+            for centre, spread in each
+        )
         free = f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {ranges}."
     return (*lines, free)
 
@@ -257,12 +263,13 @@ def _median(row: ParameterSummary) -> str:
 
 
 def _sentence(
-    stored: StoredPopulation, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary
-) -> str:
+    stored: StoredPopulation, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary,
+    called: Mapping[str, str],
+) -> str:  # fmt: skip
     """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread beside."""
     if centre.untrusted and "empirical" in stored.tree.children:
         words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
-        return f"{centre.label}: {_of_sets(stored, centre)}; {words}."
+        return f"{centre.label}: {_of_sets(stored, centre, called)}; {words}."
     spread = f"{_median(between)} ({_range(between)})"
     draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
     logarithmic = _logarithmic(draws[0])
@@ -270,7 +277,7 @@ def _sentence(
         low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
         spread = f"{middle} ({low} … {high})"
     what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
-    words = f"{centre.label} {centre.name} = {_median(centre)} (5–95 %: {_range(centre)}), "
+    words = f"{centre.label} {called.get(centre.name, centre.name)} = {_median(centre)} (5–95 %: {_range(centre)}), "
     words += f"the {what} of the population; from data set to data set it varies by {spread}"
     if logarithmic and stored.headline == "median":
         words += f"; its arithmetic mean is {_median(mean)} ({_range(mean)})"
@@ -279,7 +286,7 @@ def _sentence(
     return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
 
 
-def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[str]:
+def _compared(stored: StoredPopulation, centre: ParameterSummary, called: Mapping[str, str]) -> Iterator[str]:
     if centre.name not in stored.reference:
         return
     posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
@@ -287,41 +294,44 @@ def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[st
     source = str(stored.tree.attrs.get("reference_source", ""))
     stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
     below = float(np.mean(text.shown(posterior) < value))
-    words = f"reference: {centre.name} = {stated}{text.unit_behind(centre.unit)}{f', {source}' if source else ''}"
+    name = called.get(centre.name, centre.name)
+    words = f"reference: {name} = {stated}{text.unit_behind(centre.unit)}{f', {source}' if source else ''}"
     side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
     yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
-def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
+def _in_parts(
+    stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float, called: Mapping[str, str]
+) -> str:
     """What the interval is made of, where data sets have anything in common."""
     stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
     between, common = (text.quantity(part, std, mean.unit) for part in stds)
     return (
         f"Of this interval ± {between} comes from the data sets and how they differ, ± {common} from common quantities "
-        f"({', '.join(stored.common)}), which more data sets do not reduce."
+        f"({', '.join(called.get(name, name) for name in stored.common)}), which more data sets do not reduce."
     )
 
 
-def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
+def _of_sets(stored: StoredPopulation, centre: ParameterSummary, called: Mapping[str, str]) -> str:
     """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
     low, middle, high = text.shown(of)
     std = (high - low) / 3.29
     words = (
-        f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
+        f"the median of {len(stored.datasets)} data sets one by one is {called.get(centre.name, centre.name)} = "
         f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
         "the share of its prior's variance that its data took away"
     )
-    parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
+    parts = _in_parts(stored, centre, of, std, called).removesuffix(".") if centre.untrusted and stored.common else ""
     return f"{words}. {parts}" if parts else words
 
 
-def _together(stored: StoredPopulation, combination: Combination) -> str:
+def _together(stored: StoredPopulation, combination: Combination, called: Mapping[str, str]) -> str:
     """What is sharp: a product of powers where all are logarithms."""
-    names = " and ".join(name for name, _ in combination.parts)
+    names = " and ".join(called.get(name, name) for name, _ in combination.parts)
     if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
         return f"The data determine a combination of {names} better than each of them."
-    powers = ((name, text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
+    powers = ((called.get(name, name), text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
     product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
     return f"The data determine {product}, to {text.percent(combination.std)}, better than {names}."
 
@@ -356,7 +366,7 @@ def write_population(folder: Path) -> Path:
         folder,
         "population",
         stored=stored,
-        sentences=sentences(stored),
+        sentences=sentences(stored, stored.symbols),
         population=rows[: len(stored.words)],
         sets=rows[len(stored.words) :],
         forest=population_figure(stored),

@@ -5,8 +5,10 @@ from pkgutil import resolve_name
 from typing import Any
 
 from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, open_plain
 from en4dvar.plumbing.hints import listed
 
+LISTING = ".en4dvar-files"  # in a run directory: what the run has written, or will
 KINDS = {  # name → its declaration, imported when it is wanted
     "estimate": "en4dvar.runs.runner:EstimateKind",
     "sequence": "en4dvar.runs.cycles:SequenceKind",
@@ -32,10 +34,11 @@ def kind_in(folder: Path) -> Any:
 
 def require_no_other(folder: Path) -> None:
     """Raise :class:`OutputError`, which says what reads it, where ``folder`` holds a finished run of another kind than
-    an estimate.
+    an estimate; and where it holds a run that has no result yet, how it is continued.
     """
     kind = kind_in(folder)
     if kind is kind_named("estimate"):
+        require_result(folder)
         return
     tables = [str(folder / name) for name in (*kind.files, *kind.pages) if name.endswith(".csv")]
     if not all((folder / name).is_file() for name in kind.files if name.endswith(".csv")):  # another's sweep.csv
@@ -43,3 +46,26 @@ def require_no_other(folder: Path) -> None:
     where = f"; its numbers are in {' and '.join(tables)}" if tables else ""
     read = f"; it is read by {listed(f'en4dvar {command}' for command in kind.readers)}" if kind.readers else ""
     raise OutputError(f"{folder}: holds a run of the kind {kind.name}, and no posterior.nc of an estimate{where}{read}")
+
+
+def require_result(folder: Path) -> None:
+    """Raise :class:`OutputError` where a run has begun in ``folder``, and what it is known by is not there."""
+    listed = lines_of_list(folder)
+    kind = next((kind for kind in map(kind_named, KINDS) if kind.result in listed), None)
+    if kind is None or (folder / kind.result).exists():
+        return
+    words = f"a run of the kind {kind.name} without a result: it was stopped, has failed or is at work"
+    how = "the command of the first line of its run.log with --resume" if "run.log" in listed else "its command"
+    raise OutputError(f"{folder}: holds {words}; to continue it, repeat {how}")
+
+
+def lines_of_list(work: Path) -> tuple[str, ...]:
+    """The list of ``work`` as it is written. Raises :class:`OutputError`."""
+    listing = inside(work, LISTING)
+    try:
+        with open_plain(listing) as file:
+            return tuple(file.read().decode("utf-8").splitlines())
+    except FileNotFoundError:
+        return ()
+    except UnicodeDecodeError:
+        raise OutputError(f"{listing}: damaged; it is not a list of files") from None

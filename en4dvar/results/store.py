@@ -27,6 +27,7 @@ from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.kinds import require_no_other
@@ -172,7 +173,7 @@ class StoredResult:
         return f"{ended}; chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
 
     def __repr__(self) -> str:
-        warned = f", {len(self.warnings)} warning{'s' * (len(self.warnings) > 1)}" if self.warnings else ""
+        warned = f", {counted(len(self.warnings), 'warning')}" if self.warnings else ""
         return f"<{type(self).__name__} {self.name}: {brief(self.rows)}; {self.ended.partition(':')[0]}{warned}>"
 
     def __str__(self) -> str:

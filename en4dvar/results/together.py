@@ -346,6 +346,11 @@ class StoredPopulation(StoredGroups):
         return tuple(str(self.tree.attrs["parameters"]).split())
 
     @property
+    def symbols(self) -> dict[str, str]:
+        """Parameter or common quantity → how it is written in a figure."""
+        return {str(name): str(values.attrs["symbol"]) for name, values in self.group("posterior").data_vars.items()}
+
+    @property
     def headline(self) -> str:
         """What stands for the population: its median; in files of version 1.0 the mean, for they hold no other."""
         return HEADLINE if f"{self.names[0]}_{HEADLINE}" in self.group("posterior") else "mean"

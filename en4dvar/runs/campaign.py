@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from en4dvar.estimation.summary import ParameterSummary, frame, results_table
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import OutputError, TooFewMembersError, retold
+from en4dvar.plumbing.hints import counted
 from en4dvar.results.checkpoint import decode
 from en4dvar.results.pack import Entry, read_outcome
 
@@ -64,7 +65,7 @@ class Campaign:
 
     def __repr__(self) -> str:
         failed = f", {len(self.failures)} without a posterior" if self.failures else ""
-        return f"<Campaign of {len(self.outcomes)} data sets in {self.directory}{failed}>"
+        return f"<Campaign of {counted(len(self.outcomes), 'data set')} in {self.directory}{failed}>"
 
     def __str__(self) -> str:
         """The table of all data sets."""

@@ -17,6 +17,7 @@ from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin,
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.hints import counted
 from en4dvar.report.sequence import SequenceOutcome, TwinOutcome
 from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.netcdf import Group, to_bytes
@@ -99,7 +100,7 @@ class Cycles(RunKind[R]):
         drawn = f" and {', '.join(prior.names)}" if prior else ""
         config = self.config
         return (
-            f"{config.name}: {what}, state{drawn} estimated with {config.scheme}, {members} members, "
+            f"{config.name}: {what}, state{drawn} estimated with {config.scheme}, {counted(members, 'member')}, "
             f"seed {config.seed}\n{observed}\nrun directory: {config.directory}"
         )
 
@@ -151,7 +152,7 @@ class TwinKind(Cycles[TwinResult]):
     def _described(self) -> tuple[str, Any, int, str]:
         twin = self.config.experiment
         observed = ", ".join(f"{o.name} (std {twin.error_std[o.name]:.4g}{_unit(o.unit)})" for o in twin.observables)
-        every = f"{twin.cycles} cycles every {twin.interval:g}{_unit(self.config.model.time_unit)}"
+        every = f"{counted(twin.cycles, 'cycle')} every {twin.interval:g}{_unit(self.config.model.time_unit)}"
         told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
         return "twin experiment", twin.prior, twin.members, told
 
@@ -188,7 +189,8 @@ class SequenceKind(Cycles[SeriesResult]):
         problem, times = self.problem, self.problem.series.times
         observed = ", ".join(observable.name for observable in problem.observables)
         span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.config.model.time_unit)}"
-        told = f"{np.isfinite(problem.series.values).sum()} readings of {observed} at {len(times)} times {span}"
+        readings = counted(np.isfinite(problem.series.values).sum(), "reading")
+        told = f"{readings} of {observed} at {counted(len(times), 'time')} {span}"
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
 
 

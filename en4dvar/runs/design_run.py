@@ -28,7 +28,7 @@ from en4dvar.executor import Executor
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
-from en4dvar.plumbing.hints import rounded
+from en4dvar.plumbing.hints import counted, rounded
 from en4dvar.plumbing.units import UnitError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, digest
@@ -203,8 +203,7 @@ class DesignKind(RunKind[Designs]):
         design = self.config.design
         planned = Planned(planned_problem(self.config), design.about, design.common)
         runs = span_of_runs(planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
-        plural = "s" * (len(numbers) > 1)
-        return f"{len(numbers)} design{plural} by {method}, about {rounded(*runs)} forward runs each"
+        return f"{counted(len(numbers), 'design')} by {method}, about {rounded(*runs)} forward runs each"
 
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
         done = {d.number for d in kept.done if d.method == method}
@@ -296,7 +295,7 @@ def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
     costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
     broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
     kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-    left = (f"{o.alike} experiments: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
+    left = (f"{counted(o.alike, 'experiment')}: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
     return Done(number, method, kept, "; ".join(left) if kept else broken[0])
 
 
@@ -309,7 +308,7 @@ def _line(done: Done) -> str:
     left = f"; {done.failure}" if done.failure else ""
     if result.thin > THIN:
         left = f"; {100 * result.thin:.0f} % of the simulated readings are explained by too few effective draws{left}"
-    return f"design {done.number}: {worth}, {result.forward_runs} runs{left}"
+    return f"design {done.number}: {worth}, {counted(result.forward_runs, 'run')}{left}"
 
 
 # From a configuration to the experiments it plans

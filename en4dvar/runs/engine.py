@@ -20,9 +20,10 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
-from en4dvar.results.kinds import kind_in
+from en4dvar.results.kinds import kind_in, require_result
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
+from en4dvar.results.run_results import has_results
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
@@ -251,6 +252,8 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
     Raises :class:`OutputError`: there is no result, it is damaged, the directory cannot be written, or a file that no
     run wrote would be replaced. :class:`LackingError`: results of some data sets cannot be read; the page names them.
     """
+    if not has_results(Path(path)):
+        require_result(Path(path))
     with RunDirectory.open(path, "report") as directory:
         kind: type[Kind] = kind_in(directory.work)
         directory.claim(*(name for name in kind.pages if figures or name not in FIGURES))

@@ -22,12 +22,12 @@ from typing import Literal
 
 from en4dvar.executor.processes import end_unguarded
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, make_folder, open_plain, refused, remove_file, replace_file, write_text
+from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, replace_file, write_text
+from en4dvar.results.kinds import LISTING, lines_of_list
 from en4dvar.results.store import COMPLETE, NEXT, require_settled
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
 
-LISTING = ".en4dvar-files"
 OLD = ".en4dvar-old"
 FOLDERS = ("figures", "pages", "checkpoints")
 PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a process that was killed
@@ -272,15 +272,3 @@ def matching(work: Path, name: str) -> list[str]:
         return [place.relative_to(work).as_posix()] * os.path.lexists(place)
     there = (file for file in work.glob(name) if file.is_symlink() or not file.is_dir())
     return sorted(file.relative_to(work).as_posix() for file in there)
-
-
-def lines_of_list(work: Path) -> tuple[str, ...]:
-    """The list of ``work`` as it is written. Raises :class:`OutputError`."""
-    listing = inside(work, LISTING)
-    try:
-        with open_plain(listing) as file:
-            return tuple(file.read().decode("utf-8").splitlines())
-    except FileNotFoundError:
-        return ()
-    except UnicodeDecodeError:
-        raise OutputError(f"{listing}: damaged; it is not a list of files") from None

@@ -31,7 +31,7 @@ from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory,
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import counted, listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
@@ -51,7 +51,7 @@ class Simulation:
 
     def __repr__(self) -> str:
         series = ", ".join(f"{name} {np.nanmin(v):.4g} to {np.nanmax(v):.4g}" for name, v in self.series.items())
-        return f"<Simulation at {len(self.times)} times: {series}, units of the model>"
+        return f"<Simulation at {counted(len(self.times), 'time')}: {series}, units of the model>"
 
     @property
     def values(self) -> Array:

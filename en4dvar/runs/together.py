@@ -27,7 +27,7 @@ from en4dvar.estimation.population.own import expected_runs
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
-from en4dvar.plumbing.hints import listed, rounded
+from en4dvar.plumbing.hints import counted, listed, rounded
 from en4dvar.problem import InverseProblem
 from en4dvar.results import together as stored
 from en4dvar.results.checkpoint import FOLDER, Journal, KnownRuns, digest, file_digest, write_checkpoint
@@ -293,7 +293,8 @@ class PopulationKind(TogetherKind):
             drawn > 0
         )
         less = f", {len(sets) - drawn} have kept their draws" * (drawn < len(sets))
-        tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets{cost}{less}")
+        names = " and ".join(self.names)
+        tell(f"population: the mean of {names} over {len(sets)} data sets, and how much these differ{cost}{less}")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
         asked = config.population.part(HyperPrior) if config.population else HyperPrior()
         hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))
@@ -302,7 +303,7 @@ class PopulationKind(TogetherKind):
                 problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=hyper,
                 effort=self.effort, executor=executor, tell=tell,
             )  # fmt: skip
-        tell(f"{population.forward_runs} forward runs, {population.size:.0f} effective draws")
+        tell(f"{counted(population.forward_runs, 'forward run')}, {counted(population.size, 'effective draw')}")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
         about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 from en4dvar.assembly.build import build_one
 from en4dvar.config import Config
+from en4dvar.data.observations import SEVERAL
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.summary import brief, dataset_rows, remarks, summary_rows
@@ -22,7 +23,8 @@ from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExe
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
-from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
+from en4dvar.plumbing.files import atomic_path, open_plain, path_from, readable, remove_file
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
@@ -104,7 +106,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         lines=csv_text(dataset_rows(analysis.name, summary, analysis.cautions)),
     )
     converged = "converged" if analysis.converged else "not converged"
-    ending = f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs"
+    ending = f"{converged}: {analysis.stop_reason}; {counted(analysis.forward_runs, 'forward run')}"
     warnings = (f"{warning.severity}: {warning}" for warning in analysis.cautions)
     told = (f"estimate: {brief(summary)}", ending, *warnings)
     return Estimate(content, sha256, encode(outcome), told)
@@ -336,9 +338,11 @@ class Worklist:
         again = f"{d.name} is estimated from the start"
         before = self.run.restore(d.iteration, fingerprint, KnownRuns, again) or KnownRuns()
         if before.forecasts:
-            self.run.log.write(f"{d.name}: continued after {sum(map(len, before.forecasts))} forward runs")
+            self.run.log.write(f"{d.name}: continued after {counted(sum(map(len, before.forecasts)), 'forward run')}")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
-        own = {"data_sha256": self.run.identity.content[d.name]}
+        folder = Path(self.config.document.file).parent  # from which the configuration names the data; pages are shared
+        source = readable(SEVERAL.join(path_from(folder, str(path)) for path in d.source.paths))
+        own = {"data_sha256": self.run.identity.content[d.name], "data_source": source}
         return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:

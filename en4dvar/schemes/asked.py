@@ -10,7 +10,7 @@ import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
-from en4dvar.plumbing.hints import short
+from en4dvar.plumbing.hints import counted, short
 from en4dvar.plumbing.user_code import describe, line_of
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 
@@ -75,6 +75,7 @@ def is_done(scheme: Scheme, iteration: int, step: Step | GaussNewtonStep) -> boo
     done = bool(_asked(scheme, "done", iteration, step))
     said = scheme.passes, getattr(scheme, "max_iterations", 0), *vars(scheme).values()  # any key may be their number
     if not done and iteration + 1 >= max(MOST, *(value for value in said if isinstance(value, int))):
-        why = f"is not true after {iteration + 1} iterations; a scheme that takes more has a key max_iterations"
+        taken = counted(iteration + 1, "iteration")
+        why = f"is not true after {taken}; a scheme that takes more has a key max_iterations"
         raise _wrong(scheme, "done", why)
     return done

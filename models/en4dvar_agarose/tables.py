@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import text
@@ -153,7 +154,7 @@ def sweep_csv(result: SweepResult) -> str:
 
 def sweep_text(result: SweepResult) -> str:
     """NRMSE-weighted mean ± standard deviation of every parameter, and the range of NRMSE."""
-    lines = [f"{len(result.names)} data set(s), {result.trajectories} trajectories"]
+    lines = [f"{counted(len(result.names), 'data set')}, {result.trajectories} trajectories"]
     for p, *moments in zip(result.parameters, result.mean, result.std, strict=True):
         mean, std = (convert(float(v), p.unit, p.display_unit) for v in moments)
         spread = f" ± {std:.2g}" if len(result.names) > 1 else ""

@@ -70,7 +70,7 @@ function circle(n) {
 
 function tell() {
   const row = movie.rows.get(at), words = lines().get(at), own = circle(at);
-  const read = !row ? "not read yet" : row.R_um ? `R ${row.R_um} ± ${row.R_std_um} µm, used${row.reason ? `: ${row.reason}` : ""}` : `not used: ${row.reason}`;
+  const read = !row ? "not read yet" : row.R_um ? `R ${row.R ?? row.R_um} µm, used${row.reason ? `: ${row.reason}` : ""}` : `not used: ${row.reason}`;
   $("reading").textContent = `Frame ${at} of ${movie.count}${row ? `, ${row.t_us} µs` : ""}. ${read}.${words ? ` Correction: ${words}.` : ""}`;
   [$("x").value, $("y").value, $("radius").value] = own ? [own.x, own.y, own.r].map((v) => v.toFixed(1)) : ["", "", ""];
 }

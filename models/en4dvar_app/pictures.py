@@ -15,6 +15,7 @@ import numpy as np
 from en4dvar.inputs.parts import readable
 from en4dvar.plumbing.errors import DataError, En4dvarError
 from en4dvar.plumbing.files import read_plain
+from en4dvar.report.text import plus_minus
 from en4dvar_movie.frames import Frame, Movie, open_movie
 
 HELD = 300_000_000  # bytes of frames that are kept, so that going back reads nothing again
@@ -75,8 +76,8 @@ class Pictures:
 
 
 def readings(path: Path) -> dict[str, Any]:
-    """The table of ``en4dvar track``: pixel (um), and rows with frame, t_us, R_um, R_std_um, x_um, y_um, used, reason.
-    Raises :class:`DataError` where it is no such table.
+    """The table of ``en4dvar track``: pixel (um), and rows with frame, t_us, R_um, R_std_um, x_um, y_um, used, reason,
+    and R, the radius in as many digits as its error allows. Raises :class:`DataError` where it is no such table.
     """
     with readable(path):
         text = read_plain(path, LARGEST_TABLE).decode("utf-8", "replace")
@@ -85,7 +86,12 @@ def readings(path: Path) -> dict[str, Any]:
     rows = list(csv.DictReader(lines))
     if pixel is None or not rows or "frame" not in rows[0]:
         raise DataError(f"{path}: is not a table of 'en4dvar track'")
-    return {"pixel": float(pixel[1]), "rows": [{key: _number(row.get(key)) for key in row if key} for row in rows]}
+    told = [{key: _number(row.get(key)) for key in row if key} for row in rows]
+    for row in told:
+        radius, std = row.get("R_um"), row.get("R_std_um")
+        if isinstance(radius, float) and isinstance(std, float):
+            row["R"] = plus_minus(radius, std)
+    return {"pixel": float(pixel[1]), "rows": told}
 
 
 def _number(text: str | None) -> float | str | None:

@@ -10,6 +10,17 @@ import pytest
 from en4dvar_app import pictures
 
 
+def test_a_radius_has_the_digits_that_its_error_allows(tmp_path):
+    """The inspector said "R 143.0873 ± 0.005155 µm"."""
+    head = "frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,used,reason"
+    rows = "0,0.0,143.0873,0.005155,0,1,1,yes,\n1,1.0,,,,,,no,no bubble"
+    (tmp_path / "a.csv").write_text(f"# en4dvar track; pixel: 2.5 um;\n{head}\n{rows}\n")
+    first, second = pictures.readings(tmp_path / "a.csv")["rows"]
+    assert first["R"] == "143.0873 ± 0.0052"
+    assert first["R_um"] == 143.0873
+    assert "R" not in second
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_frames_are_the_same_in_any_order_with_little_room(tmp_path, monkeypatch, dtype):

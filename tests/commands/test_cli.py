@@ -99,7 +99,7 @@ def test_report_again(tmp_path: Path) -> None:
 def test_validate_tells_what_would_be_estimated(tmp_path: Path) -> None:
     outcome = call("validate", write_toy(tmp_path))
     assert outcome.exit_code == 0, outcome.output
-    assert "2 parameters from 1 data set(s) with en4dvar, 8 members" in outcome.stdout
+    assert "2 parameters from 1 data set with en4dvar, 8 members" in outcome.stdout
     assert re.search(r"^toy +31 +0 to 0.15 s +100 um +2 um$", outcome.stdout, re.MULTILINE)
     assert re.search(r"^k +N/m +lognormal +3 +1\.832 +4\.914$", outcome.stdout, re.MULTILINE)
     assert re.search(r"^c +0\.02 +N s/m$", outcome.stdout, re.MULTILINE)

@@ -71,10 +71,10 @@ def test_faults_of_several_data_files(tmp_path: Path) -> None:
     (tmp_path / "short.csv").write_text("t_ms,x_um\n0,1\n")
     done = call("validate", path, "--plot", "--set", f"output.directory={tmp_path}/runs/toy")
     assert done.exit_code == 0, done.output
-    assert "from 1 data set(s)" in done.stdout
+    assert "from 1 data set" in done.stdout
     assert (tmp_path / "runs" / "toy_prior.png").exists()
     head, *faults = done.stderr.splitlines()
-    assert head == "warning: a run goes on with 1 data set(s), without those that cannot be used:"
+    assert head == "warning: a run goes on with 1 data set, without those that cannot be used:"
     assert [line.startswith(f"{path}:4:9: data.path: {tmp_path}") for line in faults] == [True, True]
     assert "odd.csv: no column 'x_um'" in done.stderr
     assert "short.csv: 1 usable observations" in done.stderr

@@ -18,7 +18,7 @@ from en4dvar.cli import main
 from en4dvar.estimation.design import nested
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
-from en4dvar.report.design import design_table, fans, front, needs, readings_text, remarks
+from en4dvar.report.design import design_table, fans, front, gains, needs, readings_text, remarks, with_pretty_unit
 from en4dvar.results.design_file import load_designs
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
@@ -283,6 +283,20 @@ def test_what_is_taken_to_the_lab(tmp_path):
     taken = ", ".join(f"{t:.4g}" for t in found.rows[0].result.times)
     assert readings_text(found, found.rows[0]) == f"3, at {taken} s"
     assert f"3, at {taken} s" in (directory / "design.html").read_text()
+
+
+def test_units_of_knobs_on_the_page_are_as_of_all_figures(tmp_path):
+    """An axis said "every [us]"."""
+    every = {"key": "design.times.step", "values": ["400000 us", "800000 us"]}
+    found, directory = run_design(_plan(knobs={"every": every}, method="laplace"), out=tmp_path / "out", overrides=PAGE)
+    (panel,) = gains(found).rows[0].panels[:1]
+    assert panel.xlabel == "every (µs)"
+    page = (directory / "design.html").read_text(encoding="utf-8")
+    assert "every 400000 µs" in page
+    assert "every 400000 µs" in design_table(found)
+    assert " us<" not in page
+    assert with_pretty_unit("neo-hookean") == "neo-hookean"
+    assert with_pretty_unit("0.3") == "0.3"
 
 
 def test_as_a_command(tmp_path, monkeypatch):

@@ -58,7 +58,10 @@ def found(campaign, tmp_path_factory):
 def test_files_and_the_answer(found):
     stored, folder = found
     assert stored.names == ("k",)
-    said = re.search(r"behind 3 data sets; cost: up to about (\d+) to (\d+) forward runs each of 3$", TOLD[0])
+    said = re.search(
+        r"over 3 data sets, and how much these differ; cost: up to about (\d+) to (\d+) forward runs each of 3$",
+        TOLD[0],
+    )
     assert int(said[1]) / 4 < stored.tree.attrs["forward_runs"] / 3 < int(said[2])
     posterior = stored.group("posterior")
     assert posterior["k_mean"].dims == ("chain", "draw")
@@ -78,6 +81,17 @@ def test_files_and_the_answer(found):
     assert "set2,k," in "\n".join(rows)
     assert r"\toprule" in (folder / "population.tex").read_text()
     assert 1.5 < float(posterior["k_mean"].median()) < 2.2  # the springs are 1.6 to 2.05
+
+
+def test_its_page_writes_symbols_where_the_terminal_writes_names(found):
+    stored, _ = found
+    tree = stored.tree.copy()
+    for values in tree["posterior"].data_vars.values():
+        values.attrs["symbol"] = r"$\kappa$"
+    told = sentences(replace(stored, tree=tree), replace(stored, tree=tree).symbols)
+    assert told[0].startswith(stored.group("posterior")["k"].attrs["label"] + r" $\kappa$ = ")
+    assert not any(re.search(r"\bk\b", line.removeprefix("k ")) for line in told)
+    assert " k = " in sentences(stored)[0]
 
 
 def test_the_median_of_a_lognormal_population_lies_below_its_mean(found):

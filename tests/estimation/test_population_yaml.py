@@ -96,7 +96,7 @@ def test_warnings_of_the_population_are_on_the_page_of_the_run(finished, tmp_pat
     monkeypatch.setattr(StoredGroups, "cautions", (few,))
     write_report(run)
     page = (run / "report.html").read_text()
-    assert page.index("The population behind them: warnings") < page.index(few.words) < page.index("<svg")
+    assert page.index("The population of all data sets: warnings") < page.index(few.words) < page.index("<svg")
     assert "<code>chain-not-converged</code>" in page
 
 

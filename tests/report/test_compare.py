@@ -107,6 +107,8 @@ def test_evidences_of_different_data_are_not_compared(tmp_path):
         done = CliRunner().invoke(main, ["compare", str(one), str(other), "--no-report"])
         assert done.exit_code == 0, done.output
         assert f"not compared: {message}" in done.output
+        assert " *" in done.output
+        assert "* as the result has it" in done.output
     page = write_comparison(comparison, tmp_path / "page").read_text(encoding="utf-8")
     assert "<p>The runs sets and one hold different data sets: set2.</p>" in page
 
@@ -163,3 +165,9 @@ def test_a_comparison_prints_its_table_and_plots_a_panel_a_parameter(tmp_path):
     comparison = compare_runs([run_dir(tmp_path / "one", ("a",)), run_dir(tmp_path / "two", ("a", "b"))])
     assert str(comparison) == comparison_table(comparison)
     assert len(comparison.plot().axes) == len(comparison.parameters) == 2
+
+
+def test_the_warnings_for_which_a_verdict_is_doubted_are_listed_with_commas(tmp_path):
+    comparison = compare_runs([run_dir(tmp_path / "one", ("a",)), run_dir(tmp_path / "two", ("a", "b"))])
+    doubted = tuple(replace(score, doubted="non-gaussian at-bound") for score in comparison.scores)
+    assert "one (non-gaussian, at-bound)" in replace(comparison, scores=doubted).verdict("set1")

@@ -112,6 +112,15 @@ def test_warnings_stand_where_else_the_trust_is_told(analysis):
     assert page.index("it misfits") < page.index('id="d0-history"')
 
 
+def test_a_reading_that_counts_less_is_told_where_else_nothing_is_wrong(analysis):
+    """It said "No warnings" beside a reading 14 standard deviations off."""
+    far = caution("down-weighted", "1 of 25 observations lies beyond 1.345, down-weighted: at 12 us (14 std off)")
+    words = trust(Result.from_analysis(replace(analysis, cautions=(far,)), {}))
+    assert words.startswith("No warnings: ")
+    assert ". But 1 of 25 observations lies beyond 1.345, down-weighted: at 12 us (14 std off)." in words
+    assert "But" not in trust(Result.from_analysis(replace(analysis, cautions=()), {}))
+
+
 def with_residuals(analysis, white):
     result = Result.from_analysis(replace(analysis, cautions=()), {})
     group = result.groups["/sample_stats"]

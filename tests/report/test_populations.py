@@ -18,7 +18,16 @@ from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.inputs.members import read_members
 from en4dvar.plumbing.errors import ConfigError, OutputError
-from en4dvar.report.populations import Difference, PopulationsCompared, _sentence, figure, medians_table
+from en4dvar.report.populations import (
+    Difference,
+    PopulationsCompared,
+    _sentence,
+    compare_populations,
+    figure,
+    medians_table,
+    sentences,
+)
+from en4dvar.report.text import with_symbols
 from en4dvar.results.together import load_population
 from en4dvar.runs.design_run import run_design
 from en4dvar.runs.runner import run_campaign
@@ -235,3 +244,17 @@ def test_words_of_a_difference():
     )
     assert _sentence(shift).startswith("G of a is 5.00 (4.00 … 6.00) kPa less than that of b; it is smaller with")
     assert _sentence(shift).endswith("not to be trusted: chain-not-converged.")
+
+
+def test_a_page_writes_parameters_by_their_symbols_and_the_terminal_by_their_names(gels):
+    """The page of one bubble says μ where that of its population said mu."""
+    of = compare_populations(only(gels), known={"soft_only": {"k": "1.8 ± 0.1 N/m"}})
+    of = replace(of, symbols={"k": r"$\kappa$", "c": "$c_1$"}, common=("c",))
+    plain, written = list(sentences(of)), list(sentences(of, of.symbols))
+    assert plain[0].startswith("k of soft_only")
+    assert "alike: c." in plain[1]
+    assert written[0].startswith(r"$\kappa$ of soft_only")
+    assert "alike: $c_1$." in written[1]
+    (note,) = [words for words in written if "is known" in words]
+    assert note.startswith(r"$\kappa$ of soft_only is known")
+    assert with_symbols(note).startswith("<i>κ</i> of soft_only")

@@ -20,12 +20,13 @@ from run_files import add_to_pack
 
 from en4dvar import report
 from en4dvar.diagnosis.diagnostics import chi2_interval, member_quantiles
+from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior
 from en4dvar.report import write_pages
-from en4dvar.report.figures import FIGURES, all_figures, traces
+from en4dvar.report.figures import FIGURES, all_figures, pairs, traces
 from en4dvar.report.history import history
 from en4dvar.report.html import render
 from en4dvar.report.page import LISTED, SetSummary, judge_chi2, overview_figures, render_overview
@@ -438,3 +439,44 @@ def test_no_band_of_a_positive_quantity_is_negative(analysis):
     readings = result.observed_data["R"].values
     low = changed("/observed_data", "R", readings - 0.99 * readings.min())
     assert history(low).rows[0].panels[0].ylim[0] == 0
+
+
+def test_a_pair_of_parameters_shows_its_correlation_by_its_colour(analysis):
+    """Half of the figure was empty but for numbers."""
+    result = Result.from_analysis(analysis, {})
+    rows = pairs(result).rows
+    first, second = (result.members("posterior", row.name) for row in result.rows[:2])
+    shown = rows[0].panels[1]
+    correlation = float(np.corrcoef(first, second)[0, 1])
+    (mark,) = shown.marks
+    assert mark.kind == "span"
+    assert mark.colour == ("centre" if correlation < 0 else "posterior")
+    assert mark.alpha == pytest.approx(0.6 * abs(correlation))
+    assert shown.words == f"{correlation:+.2f}".replace("-", "−")
+    ((_, _, svg),) = draw([("pairs", "", pairs(result))])
+    count = len(result.rows) * (len(result.rows) - 1) // 2
+    assert len(re.findall(r'<path d="M[^"]*z"[^>]*opacity="0\.\d+"[^>]*/></g><text', svg)) == count
+
+
+def test_one_of_a_thing_is_not_called_several(analysis):
+    sets = [SetSummary.of(Result.from_analysis(replace(analysis, cautions=()), {}), "a")]
+    page = render_overview(sets, pages={}, failures={"b": "no readings"}, headlines=(), figures=())
+    for words in ("<h1>1 data set</h1>", "1 data set without a posterior", "No warnings in any of 1 posterior."):
+        assert words in page
+
+
+def test_the_mean_of_a_prior_about_zero_is_zero_and_no_rounding(analysis):
+    """A summary said that the prior mean of t_s is 3.47e-18."""
+    p = analysis.parameters[0]
+    members = np.array([-0.3, -0.1, 0.1, 0.3]) + 3.47e-18
+    assert members.mean() != 0
+    assert ParameterSummary.of(p, members, members + 1.0, 1.0, 0.5, ()).prior_mean == 0
+    assert ParameterSummary.of(p, members + 1e-9, members, 1.0, 0.5, ()).prior_mean == pytest.approx(1e-9)
+
+
+def test_a_page_that_is_shared_names_no_folder_of_the_machine(write_run, analysis):
+    readings = replace(analysis.observations, source="/home/jane/secret gel/bubble_1.csv")
+    page = write_pages(write_run(replace(analysis, problem=replace(analysis.problem, observations=readings))))
+    text = page.read_text(encoding="utf-8")
+    assert "<td>…/bubble_1.csv</td>" in text
+    assert "jane" not in text

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from en4dvar.report import text
 from en4dvar.report.chart import GREYS, ramp
 from en4dvar.report.export import is_math, latex_unit
+from en4dvar.report.result import Result
 
 NAN = float("nan")
 
@@ -40,8 +43,8 @@ def test_what_is_written(written, arguments, expected):
         (101325.0, 250.0, "101325 ± 250"),
         (5.0, 0.0, "5.000 ± 0.000"),
         (float("nan"), float("nan"), "– ± –"),
-        (3.2e9, 1e8, "3.2×10⁹ ± 1×10⁸"),
-        (2e-9, 1e-10, "2×10⁻⁹ ± 1×10⁻¹⁰"),
+        (3.2e9, 1e8, "(3.20 ± 0.10)×10⁹"),
+        (2e-9, 1e-10, "(2.00 ± 0.10)×10⁻⁹"),
     ],
 )
 def test_plus_minus(mean, std, shown):
@@ -63,3 +66,17 @@ def test_no_minus_stands_before_a_rounded_zero():
 )
 def test_symbols_as_html(symbol, html):
     assert str(text.symbol_html(symbol)) == html
+
+
+def test_numbers_far_from_one_are_written_in_a_power_of_their_unit(analysis):
+    """Six columns of 6.04×10⁻⁹ made the table of a coated bubble wider than a screen."""
+    row = Result.from_analysis(analysis, {}).rows[0]
+    assert text.in_powers(row) is row
+    values = {name: 1e-9 * getattr(row, name) for name in text.VALUES}
+    small = text.in_powers(replace(row, unit="kg/s", **values))
+    power = text.power_of(values["mean"], values["std"])
+    assert power in (-9, -6)
+    assert small.mean * 10.0**power == pytest.approx(values["mean"])
+    assert small.q95 * 10.0**power == pytest.approx(values["q95"])
+    assert text.pretty_unit(small.unit) == f"10{'⁻⁹' if power == -9 else '⁻⁶'}·kg/s"
+    assert small.dfs == row.dfs

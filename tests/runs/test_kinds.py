@@ -125,6 +125,22 @@ def test_a_command_that_does_not_read_a_kind_of_run_names_it_and_those_that_do(
         assert all(f"en4dvar {reader}" in done.stderr for reader in kind.readers)
 
 
+@pytest.mark.parametrize("command", {**READ, "report": ()})
+@pytest.mark.parametrize("name", KINDS)
+def test_a_run_without_a_result_is_named_with_what_continues_it(tmp_path: Path, name: str, command: str) -> None:
+    """A killed run of any kind was asked whether it is the directory of a finished one."""
+    kind, own = kind_named(name), () if name in IN_PLACE else OF_EVERY_RUN
+    for folder in ("done", "again"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / LISTING).write_text("".join(f"{file}\n" for file in (*own, *kind.files, *kind.pages)))
+    done = call(tmp_path, command, "done", *{**READ, "report": ()}[command])
+    how = "its command" if name in IN_PLACE else "the command of the first line of its run.log with --resume"
+    assert done.exit_code == 2
+    assert f"done: holds a run of the kind {name} without a result: it was stopped, has failed or is at" in done.stderr
+    assert done.stderr.rstrip().endswith(f"; to continue it, repeat {how}")
+    assert (tmp_path / "done" / LISTING).read_text().splitlines() == [*own, *kind.files, *kind.pages]
+
+
 def test_a_table_of_the_same_name_makes_no_run_of_a_kind(tmp_path: Path) -> None:
     """``en4dvar sweep`` writes a table of trajectories called as that of a sweep over twin experiments."""
     (tmp_path / "done").mkdir()

@@ -21,6 +21,7 @@ from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.results.pack import PACK, results_of
 from en4dvar.runs import engine, rundir
 from en4dvar.runs.lock import LOCK, locked
+from en4dvar.runs.rerun import rerun
 from en4dvar.runs.rundir import LISTING, NEXT, RunDirectory
 from en4dvar.runs.runner import run, run_campaign
 
@@ -289,3 +290,19 @@ def test_a_model_that_leaves_the_folder(tmp_path, monkeypatch, at_import):
     assert done.exit_code == 0, done.stderr
     assert (folder / "run" / "posterior.nc").is_file()
     assert not list((tmp_path / "there").iterdir())
+
+
+def test_the_page_names_the_data_as_the_configuration_does_and_the_command_the_page_as_it_was_asked(
+    tmp_path, monkeypatch
+):
+    """Pages are shared: each told where on the machine the data lie."""
+    (tmp_path / "private" / "here").mkdir(parents=True)
+    write_toy(tmp_path / "private")
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(main, ["run", "private/toy.yaml", "--out", "private/here/run"]).exit_code == 0
+    told = CliRunner().invoke(main, ["report", "private/here/run"])
+    assert told.stdout == "report: private/here/run/report.html\n"
+    page = (tmp_path / "private" / "here" / "run" / "report.html").read_text(encoding="utf-8")
+    assert "<tr><td>data source</td><td>toy.csv</td></tr>" in page
+    assert str(tmp_path) not in page
+    assert rerun("private/here/run").same

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import random
+import re
 from pathlib import Path
 
 import drift_series
@@ -18,7 +19,9 @@ from scipy.stats import multivariate_normal
 
 from en4dvar.data.noise import Correlation
 from en4dvar.plumbing.errors import DataError, OutputError
-from en4dvar.report.sequence import compare_sequences, cycles_table, sequences_table
+from en4dvar.report.sequence import averaged, compare_sequences, cycles_table, sequences_table
+from en4dvar.results.netcdf import Group, variable
+from en4dvar.results.series_file import MEAN
 from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.rerun import rerun
 from en4dvar.series.moments import log_evidence
@@ -172,3 +175,30 @@ def test_a_sequence_killed_and_resumed(tmp_path):
         with xr.open_dataset(out / "sequence.nc") as a, xr.open_dataset(tmp_path / "quiet" / "sequence.nc") as b:
             assert a.variables.keys() == b.variables.keys()
             assert all(a[name].variable.identical(b[name].variable) for name in a.variables)
+
+
+def test_a_score_has_the_digits_that_its_scatter_over_the_cycles_allows():
+    """RMSE 0.03962 was printed where the next digit but one is chance; scores of neighbouring cycles are alike."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(300):
+        series = np.zeros(1050)
+        for k in range(1, len(series)):
+            series[k] = 0.8 * series[k - 1] + rng.standard_normal()
+        after = 10 + series[50:]
+        score = variable("time", 10 + series, "1", "RMSE", **{MEAN: after.mean()})
+        found.append(averaged(Group({"analysis_rmse": score}, attrs={"burn_in": 50}), "analysis_rmse"))
+    means, errors = np.array(found).T
+    assert 0.85 < np.sqrt(np.mean(errors**2)) / means.std() < 1.15
+    single = Group({"s": variable("time", [3.0], "1", "RMSE", **{MEAN: 3.0})}, attrs={"burn_in": 0})
+    assert averaged(single, "s") == (3.0, pytest.approx(0.3))
+
+
+def test_the_page_of_a_sequence_has_the_digits_of_the_spread(folder):
+    run_dir, _ = conducted(output={"report": True})
+    page = (run_dir / "report.html").read_text(encoding="utf-8")
+    at_end = page.partition("State and parameters at the end")[2].partition("</table>")[0]
+    cells = re.findall(r"<td>(−?[0-9.]+)</td><td>([0-9.]+)</td>", at_end)
+    assert len(cells) == 2
+    for mean, std in cells:
+        assert len(mean.partition(".")[2]) == len(std.partition(".")[2])
+        assert len(std.partition(".")[2].lstrip("0")) <= 2

@@ -15,7 +15,7 @@ from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import counted, listed
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, PriorTerm
 
@@ -57,8 +57,8 @@ def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
             "rank-deficient", f"{words}: the posterior cannot move in the others and its spread there is zero"
         )
     elif len(posterior) <= n:
-        words = f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters"
-        yield caution("rank-deficient", words)
+        alive = f"{counted(len(posterior), 'member')} of the posterior alive"
+        yield caution("rank-deficient", f"{alive}, too few for the covariance of {n} parameters")
 
 
 def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
@@ -343,15 +343,16 @@ def _two(p: Parameter, between: str, first: float, second: float) -> str:
 
 
 def down_weighted(analysis: Analysis) -> Findings:
-    """Observations that a robust cost counts less; :data:`MOST_LISTED` of them are listed."""
+    """Observations that a robust cost counts less, as far off as their weight says; :data:`MOST_LISTED` are listed."""
     weights = analysis.down_weights
     if weights is None or not np.any(weights < 1):
         return
     lighter, moment, within = np.flatnonzero(weights < 1), moments(analysis), analysis.observations.noise.counts_within
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    where = listed((f"{moment[k]} (weight {weights[k]:.2g})" for k in worst), MOST_LISTED)
-    beyond = f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations"
-    yield caution("down-weighted", f"{beyond} and were down-weighted: at {where} {CLOCK}")
+    off = (f"{moment[k]} ({within / weights[k]:.2g} std off, weight {weights[k]:.2g})" for k in worst)
+    where, lie = listed(off, MOST_LISTED), "lies" if len(worst) == 1 else "lie"
+    beyond = f"{len(worst)} of {len(weights)} observations {lie} beyond {within:g} standard deviations"
+    yield caution("down-weighted", f"{beyond}, down-weighted: at {where} {CLOCK}")
 
 
 def weighted(analysis: Analysis) -> Findings:

@@ -14,6 +14,7 @@ differ by what the change does within one cell. The reading of an instant is thu
 should: a rebound tells of the viscosity in the collapse before it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,12 +63,14 @@ class Ledger:
         return np.array([[weighted_quantiles(v, w) for v in self.values] for w in self.weights])
 
 
-def weighted_quantiles(values: Array, weights: Array) -> Array:
-    """The :data:`QUANTILES` of values (M,) with weights (M,) that sum to one; NaN where a weight is."""
+def weighted_quantiles(values: Array, weights: Array, levels: Sequence[float] = QUANTILES) -> Array:
+    """The quantiles of values (M,) with weights (M,) that sum to one, on the line through the middles of the weights of
+    neighbours; NaN where a weight is.
+    """
     order = np.argsort(values)
     share = np.cumsum(weights[order]) - 0.5 * weights[order]
     known = np.isfinite(share).all()
-    return np.interp(QUANTILES, share, values[order]) if known else np.full(len(QUANTILES), np.nan)
+    return np.interp(levels, share, values[order]) if known else np.full(len(levels), np.nan)
 
 
 def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Ledger | None:

@@ -28,6 +28,7 @@ from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import counted
 from en4dvar.priors.prior import member_stream, whiten_sample
 from en4dvar.problem import InverseProblem
 
@@ -156,7 +157,8 @@ def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str
     """
     chi2 = chi2_per_reading * readings + 2 * cost_change
     limit = max(1.0, chi2_per_reading) * (readings + EXCLUDED * math.sqrt(2 * readings))
-    return f"the readings exclude it: χ² is {chi2:.0f} for {readings} readings" if readings and chi2 > limit else ""
+    excluded = f"the readings exclude it: χ² is {chi2:.0f} for {counted(readings, 'reading')}"
+    return excluded if readings and chi2 > limit else ""
 
 
 def what_if(

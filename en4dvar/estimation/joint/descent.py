@@ -19,6 +19,7 @@ from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import counted
 from en4dvar.priors.prior import whiten_sample
 from en4dvar.schemes.base import Minimiser
 
@@ -335,7 +336,7 @@ class JointObjective(Objective[JointDescent]):
                 descent.converged = True
                 descent.stop = f"the next step is {norm:.1g} posterior standard deviations long"
             elif len(descent.costs) > scheme.max_iterations:
-                descent.stop = f"{scheme.max_iterations} iterations"
+                descent.stop = counted(scheme.max_iterations, "iteration")
             descent.ended = bool(descent.stop)
 
     def search(self, descent: JointDescent) -> Search:

@@ -29,7 +29,7 @@ from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
-from en4dvar.plumbing.hints import rounded
+from en4dvar.plumbing.hints import counted, rounded
 from en4dvar.priors.prior import own_seed
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.settings import AssimilationSettings
@@ -141,7 +141,7 @@ class _Estimate:
         singles = singles or self._singles()
         descents = self._descents(self._starts(singles))
         lowest = self._challenged(min(descents, key=lambda descent: descent.at.cost))
-        self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
+        self.tell(f"J {lowest.at.cost:.4g} after {counted(len(lowest.costs) - 1, 'iteration')}, {lowest.stop}")
         members, cautions = self._members(lowest)
         grids = tuple(plotting_times(problem) for problem in joint.experiments)
         forecasts = tuple(

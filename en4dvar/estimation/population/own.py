@@ -32,6 +32,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
@@ -416,16 +417,10 @@ def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[f
     """The weighted median of data sets (S,), and its standard deviation."""
     weights = np.maximum(1 - std**2, SILENT)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
-    medians = _weighted_medians(middle[chosen], weights[chosen])
+    medians = np.array([_weighted_median(middle[of], weights[of]) for of in chosen])
     spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))
-    return float(_weighted_medians(middle[None], weights[None])[0]), spread
+    return _weighted_median(middle, weights), spread
 
 
-def _weighted_medians(x: Array, weights: Array) -> Array:
-    """(R,) of the rows of values (R, S): between two neighbours, on the line through the middles of their weights."""
-    order = np.argsort(x, axis=1)
-    x, weights = np.take_along_axis(x, order, axis=1), np.take_along_axis(weights, order, axis=1)
-    middles = (np.cumsum(weights, axis=1) - 0.5 * weights) / weights.sum(axis=1, keepdims=True)
-    rows, above = np.arange(len(x)), np.sum(middles < 0.5, axis=1).clip(1, x.shape[1] - 1)
-    (low, high), (first, last) = ([of[rows, above - 1], of[rows, above]] for of in (middles, x))
-    return np.asarray(first + (last - first) * ((0.5 - low) / (high - low)).clip(0.0, 1.0))
+def _weighted_median(x: Array, weights: Array) -> float:
+    return float(weighted_quantiles(x, weights / weights.sum(), (0.5,))[0])

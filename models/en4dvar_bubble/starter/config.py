@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from en4dvar.inputs.matfile import indexed
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.readers import AGAIN, BELOW, CLIPPED, FAR, LEVEL, ODD, Readings, read_series
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.files import expanded, path_from
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.elsewhere import Entry, known, scale_of
 from en4dvar_bubble.starter.grouped import grouped, parted
@@ -306,13 +305,6 @@ def without_unit(name: str) -> str:
     """A column's name without what :func:`unit_in` reads."""
     last = name.rpartition(".")[2]
     return parted(last)[0] if unit_in(name, "m") else last
-
-
-def path_from(folder: Path, data: str) -> str:
-    """``data`` as a file in ``folder`` says it: relative where both share more than the root."""
-    path, here = expanded(data).absolute(), folder.absolute()
-    near = path.parts[:2] == here.parts[:2] and len(here.parts) > 1
-    return Path(os.path.relpath(path, here)).as_posix() if near else path.as_posix()
 
 
 def run_name(data: str) -> str:
