@@ -13,7 +13,7 @@ from en4dvar.priors.prior import PriorTerm
 class Wells(Toy):
     """y = f(a) + b t with f(a) = a² (two wells alike) or, for a > 0, (3 a)² (one of them three times as narrow)."""
 
-    narrow = False
+    narrow, of_arrays = False, True
 
     def curve(self, theta, t):
         a, b = theta
