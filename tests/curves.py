@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 
 OBSERVABLE = Observable("y", "m", StateField("y", rate_of="v"))
@@ -71,7 +71,7 @@ class Closed(Toy):
         y, v = (np.broadcast_to(of(theta.T[..., None], own), own.shape) for of in (self.curve, self.rate))
         held = np.broadcast_to(theta[:, None], (*own.shape, theta.shape[1]))
         states = np.concatenate([y[..., None], v[..., None], held], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 class Decay(Closed):
@@ -133,7 +133,7 @@ class Vectorised(Linear):
         v = -np.sum(x[:, None, 2:] * j * np.sin(phase), axis=-1)
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, len(j)))
         states = np.concatenate([y[..., None], v[..., None], theta], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 class Counted:
