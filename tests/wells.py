@@ -6,14 +6,14 @@ import numpy as np
 from toys import Toy, make_observations, make_problem
 
 from en4dvar.estimation.assimilate import log_posterior
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import PriorTerm
 
 
 class Wells(Toy):
     """y = f(a) + b t with f(a) = a² (two wells alike) or, for a > 0, (3 a)² (one of them three times as narrow)."""
 
-    narrow = False
+    narrow, of_arrays = False, True
 
     def curve(self, theta, t):
         a, b = theta
@@ -26,10 +26,7 @@ class Wells(Toy):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, len(self.parameters)))
         parts = self.curve(theta.transpose(2, 0, 1), own), self.rate(theta.transpose(2, 0, 1), own)
-        return [
-            Trajectory(t, s, self.layout)
-            for t, s in zip(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), strict=True)
-        ]
+        return Batch(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), self.layout)
 
 
 class UnlikeWells(Wells):

@@ -13,6 +13,7 @@ import ast
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -58,6 +59,7 @@ def about(entry: EntryPoint) -> str:
     return _first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
 
 
+@cache
 def _first_sentence(entry: EntryPoint) -> str:
     top, *rest = entry.module.split(".")
     spec = find_spec(top)

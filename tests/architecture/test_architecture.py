@@ -13,6 +13,7 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from syntax import nodes
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(p for top in ("en4dvar", "models", "tests", "benchmarks") for p in (ROOT / top).rglob("*.py"))
@@ -24,7 +25,7 @@ HEAVY = ("numba", "xarray", "matplotlib", "scipy", "pydantic", "pandas", "netCDF
 def imported_modules(source: str) -> set[str]:
     """Every module that a file imports, at any depth of nesting, also by ``import_module("…")``."""
     names = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(source):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

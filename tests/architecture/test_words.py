@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
-from functools import cache
 from pathlib import Path
 
 import pytest
+from syntax import nodes
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted(p for top in ("en4dvar", "models") for p in (ROOT / top).rglob("*.py"))
@@ -38,12 +38,6 @@ VAGUE = {"found", "one", "given"}  # of a variable or an argument: they say how 
 def words(name: str) -> list[str]:
     """The words of an identifier, lower case: of snake_case and CamelCase."""
     return [w.lower() for part in name.split("_") for w in re.findall(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])", part)]
-
-
-@cache
-def nodes(source: str) -> tuple[ast.AST, ...]:
-    """All of a file's syntax, read once for all tests."""
-    return tuple(ast.walk(ast.parse(source)))
 
 
 def names(source: str) -> set[str]:

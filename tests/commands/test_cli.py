@@ -18,6 +18,7 @@ from en4dvar.commands.run import _tell, _Warnings
 from en4dvar.config import load_config
 from en4dvar.estimation.summary import ParameterSummary, brief
 from en4dvar.plumbing.caution import caution
+from en4dvar.report.figures import FIGURES
 from en4dvar.report.result import load_result
 from en4dvar.results.pack import PACK
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
@@ -29,9 +30,12 @@ def call(*arguments: str | Path) -> Result:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """A run of the toy configuration: its directory and what the command said."""
+    """A run of the toy configuration, of whose figures two are drawn: its directory and what the command said."""
     folder = tmp_path_factory.mktemp("finished")
-    outcome = call("run", write_toy(folder), "--out", folder / "run", "--set", "output.figures=true")
+    two = tuple(figure for figure in FIGURES if figure[0] in ("posterior", "history"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("en4dvar.report.figures.FIGURES", two)
+        outcome = call("run", write_toy(folder), "--out", folder / "run", "--set", "output.figures=true")
     return folder / "run", outcome
 
 

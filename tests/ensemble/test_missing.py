@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Decay, Linear, make_problem
+from toys import Decay, Vectorised, make_problem
 
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.ensemble.missing import filled, fitted
@@ -54,7 +54,7 @@ def posterior(problem):
 @pytest.mark.parametrize("step_control", ["line-search", "levenberg-marquardt", "full"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_third_of_the_readings_missing_leaves_the_posterior(linearisation, step_control, seed):
-    _, problem = patchy(Linear(NAMES), TRUTH, seed)
+    _, problem = patchy(Vectorised(NAMES), TRUTH, seed)
     analysis = assimilate(problem, settings(linearisation=linearisation, step_control=step_control), seed)
     mean, cov = posterior(problem)
     std = np.sqrt(np.diag(cov))
@@ -69,7 +69,7 @@ def test_a_third_of_the_readings_missing_leaves_the_posterior(linearisation, ste
 @pytest.mark.parametrize("refine", ["auto", "mcmc"])
 def test_no_chain_is_run_to_which_a_draw_without_a_reading_is_impossible(refine):
     """It would end where few readings are missing, and nowhere else."""
-    _, problem = patchy(Linear(NAMES), TRUTH)
+    _, problem = patchy(Vectorised(NAMES), TRUTH)
     analysis = assimilate(problem, settings(refine=refine), 1)
     mean, cov = posterior(problem)
     assert not analysis.refinement
@@ -80,7 +80,7 @@ def test_no_chain_is_run_to_which_a_draw_without_a_reading_is_impossible(refine)
 
 @pytest.mark.parametrize("scheme", [name for name in ON_A_WINDOW if name != "particle-filter"])
 def test_every_scheme_of_a_window_gives_what_it_gives_without_gaps(scheme):
-    whole, problem = patchy(Linear(NAMES), TRUTH)
+    whole, problem = patchy(Vectorised(NAMES), TRUTH)
     each = [assimilate(p, settings(scheme=scheme), 4) for p in (whole, problem)]
     assert each[1].posterior == pytest.approx(each[0].posterior, abs=1e-6)
 
@@ -94,7 +94,7 @@ def test_a_curved_model_finds_its_minimum():
 
 
 def test_the_same_bits_for_any_worker_count():
-    _, problem = patchy(Linear(NAMES), TRUTH)
+    _, problem = patchy(Vectorised(NAMES), TRUTH)
     alone = assimilate(problem, settings(), 4, SerialExecutor())
     with ProcessesExecutor(2) as executor:
         assert_same_bits(alone, assimilate(problem, settings(), 4, executor))
@@ -102,7 +102,7 @@ def test_the_same_bits_for_any_worker_count():
 
 def test_a_member_without_any_reading_or_with_an_infinite_one_has_failed():
     for worst in (np.nan, np.inf):
-        _, problem = patchy(Linear(NAMES), TRUTH, operator=Patchy(worst=worst, lost=0.2))
+        _, problem = patchy(Vectorised(NAMES), TRUTH, operator=Patchy(worst=worst, lost=0.2))
         x = problem.prior.sample(40, 0)
         run = forecast(problem, x)
         full = filled(run, x)
@@ -117,7 +117,7 @@ def test_a_member_without_any_reading_or_with_an_infinite_one_has_failed():
 
 
 def test_a_reading_that_no_member_gives_loses_all():
-    _, problem = patchy(Linear(NAMES), TRUTH, operator=lambda path: np.where(np.arange(9) == 3, np.nan, path["y"]))
+    _, problem = patchy(Vectorised(NAMES), TRUTH, operator=lambda path: np.where(np.arange(9) == 3, np.nan, path["y"]))
     with pytest.raises(TooFewMembersError, match="non-finite prediction"):
         assimilate(problem, settings(), 4)
 
@@ -140,7 +140,7 @@ def test_a_run_that_ends_for_a_reading_that_too_few_members_have_names_it(most):
         y[3] = np.where(path["theta"][0, 0] > most, np.nan, y[3])
         return y
 
-    _, problem = patchy(Linear(NAMES), TRUTH, operator=lacking)
+    _, problem = patchy(Vectorised(NAMES), TRUTH, operator=lacking)
     time = problem.observations.times[3]
     with pytest.raises(
         TooFewMembersError, match=rf"if any, have a number for reading 4 of y \(at {time:.6g} s\): leave"

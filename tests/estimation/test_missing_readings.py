@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from field_models import READ, TIMES, VALUES, Line
-from toys import Linear, make_problem
+from toys import Vectorised, make_problem
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
@@ -171,7 +171,7 @@ NAMES = ("a", "b", "c")
 def experiments(gaps, count=2):
     found = []
     for e in range(count):
-        problem = make_problem(Linear(NAMES), np.array([1.0, -0.5, 0.3 * e]), seed=e)
+        problem = make_problem(Vectorised(NAMES), np.array([1.0, -0.5, 0.3 * e]), seed=e)
         problem = replace(problem, observations=replace(problem.observations, name=f"set {e}"))
         operator = problem.observable.operator
         found.append(replace(problem, observable=Observable("y", "m", OfRun(operator) if gaps else operator)))

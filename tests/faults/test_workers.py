@@ -2,33 +2,17 @@
 
 import fcntl
 import os
-import signal
 import socket
 import sys
 import termios
 import time
-from pathlib import Path
 from types import ModuleType
 
 import pytest
+from worker_calls import LARGE, cannot_be_sent, counted_suicide, fine, large, slow, tells_much
 
 from en4dvar.executor import ExecutorError, ProcessesExecutor, WorkerLostError, processes
 from en4dvar.executor.processes import _Worker
-
-LARGE = 4_000_000  # bytes; a pipe holds some 200 000, so that a worker is writing until we have read most of it
-
-
-def large():
-    return bytes(LARGE)
-
-
-def fine(number):
-    return number, bytes(LARGE)
-
-
-def slow(number):
-    time.sleep(0.02)
-    return number
 
 
 def announced(worker):
@@ -70,12 +54,6 @@ def test_a_worker_killed_while_it_hands_back_its_result(killed_while_it_writes):
         assert [v[0] for _, v in sorted(executor.map(fine, [(j,) for j in range(5)]))] == list(range(5))
 
 
-def tells_much(tell):
-    tell("before")
-    tell(large())
-    return "done"
-
-
 @pytest.mark.fault("worker-killed")
 def test_a_worker_killed_while_it_tells_something(killed_while_it_writes):
     heard = []
@@ -104,20 +82,6 @@ def test_a_call_that_kills_is_given_up_after_three_workers(tmp_path):
     assert isinstance(found[0], WorkerLostError)
     assert found[1] == 0
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def counted_suicide(folder):
-    if not Path(folder).is_dir():
-        return 0
-    (Path(folder) / f"{os.getpid()}").touch()
-    os.kill(os.getpid(), signal.SIGKILL)
-    return 1
-
-
-def cannot_be_sent(what):
-    if what == "value":
-        return lambda: None
-    raise ValueError("with something in it", lambda: None)
 
 
 @pytest.mark.fault("worker-killed")

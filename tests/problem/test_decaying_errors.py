@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimation.test_field_modes import READ, TIMES, VALUES, line
-from toys import Linear, make_problem
+from toys import Vectorised, make_problem
 
 import en4dvar
 from en4dvar.data.noise import CorrelatedNoise, Correlation, DecayingErrors, Linearisation, Predicted, SharedErrors
@@ -42,7 +42,7 @@ def test_every_product_is_that_of_the_matrix(step):
 
 @pytest.mark.parametrize("time_std", [0.0, 0.02])
 def test_an_estimate_is_that_of_the_matrix(time_std):
-    problem = make_problem(Linear(("a", "b", "c")), [1.0, -0.5, 0.7], std=0.1, k=K)
+    problem = make_problem(Vectorised(("a", "b", "c")), [1.0, -0.5, 0.7], std=0.1, k=K)
     times, settings = problem.observations.times, AssimilationSettings(members=20, sampling="exact")
     decaying = DecayingErrors(times / 0.3)
 

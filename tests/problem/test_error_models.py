@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from toys import Decay, Linear, Wave, make_observations, make_problem, visit, with_noise
+from toys import Decay, Vectorised, Wave, make_observations, make_problem, visit, with_noise
 
 from en4dvar.data.noise import Linearisation, Predicted, noise_of
 from en4dvar.data.observations import Observations
@@ -55,7 +55,7 @@ def test_one_iteration_with_correlated_errors_is_the_kalman_smoother(
     correlation, weight, step_control, linearisation, tolerance
 ):
     std = np.linspace(0.05, 0.2, K)
-    problem = with_errors(make_problem(Linear(NAMES), TRUTH, std=std, weights=weight), correlation=correlation)
+    problem = with_errors(make_problem(Vectorised(NAMES), TRUTH, std=std, weights=weight), correlation=correlation)
     settings = AssimilationSettings(
         members=20, start="prior-mean", max_iterations=1, linearisation=linearisation, step_control=step_control
     )
@@ -184,7 +184,7 @@ def test_information_of_the_noise_scale_is_that_of_the_density(huber):
 def test_noise_scale_against_quadrature():
     """Linear model, σ unknown: a and ln σ on a grid, against the ensemble and its evidence."""
     k = 60
-    problem = make_problem(Linear(("a",)), [1.0], std=0.1, k=k, seed=4)
+    problem = make_problem(Vectorised(("a",)), [1.0], std=0.1, k=k, seed=4)
     noise = problem.observations.values - [problem.model.curve(np.array([1.0]), t) for t in problem.observations.times]
     values = problem.observations.values + 0.7 * noise  # the scatter is 1.7 times what is stated
     problem = with_errors(problem, values=values, sigma=0.7)
@@ -218,8 +218,8 @@ def test_noise_scale_against_quadrature():
 
 
 def test_fixed_noise_scale_scales_the_errors():
-    plain = make_problem(Linear(NAMES), TRUTH, std=0.2)
-    scaled = replace(make_problem(Linear(NAMES), TRUTH, std=0.1), fixed={"sigma": 2.0})
+    plain = make_problem(Vectorised(NAMES), TRUTH, std=0.2)
+    scaled = replace(make_problem(Vectorised(NAMES), TRUTH, std=0.1), fixed={"sigma": 2.0})
     scaled = replace(scaled, observations=replace(scaled.observations, values=plain.observations.values))
     a, b = (assimilate(p, AssimilationSettings(members=12), 2) for p in (plain, scaled))
     assert a.posterior == pytest.approx(b.posterior, rel=1e-9)
@@ -227,7 +227,7 @@ def test_fixed_noise_scale_scales_the_errors():
 
 
 def test_a_models_own_sigma_is_not_the_noise_scale():
-    problem = make_problem(Linear(("sigma",)), [1.0])
+    problem = make_problem(Vectorised(("sigma",)), [1.0])
     run = forecast(problem, problem.prior.sample(4, 1))
     assert run.predicted.noise_scale is None
     assert run.active.all()
@@ -240,7 +240,7 @@ def outlier(problem, k=3, by=3.0):
 
 
 def test_an_outlier_leaves_the_robust_posterior_where_it_was():
-    plain = make_problem(Linear(NAMES), TRUTH, k=61)
+    plain = make_problem(Vectorised(NAMES), TRUTH, k=61)
     spoilt = outlier(plain)
     settings = AssimilationSettings(members=20)
     clean = assimilate(plain, settings, 1)
@@ -270,7 +270,7 @@ def test_an_outlier_leaves_the_robust_posterior_where_it_was():
 
 
 def test_robust_posterior_against_quadrature():
-    plain = make_problem(Linear(("a",)), [1.0], std=0.1, k=60, seed=2)
+    plain = make_problem(Vectorised(("a",)), [1.0], std=0.1, k=60, seed=2)
     problem = with_errors(plain, values=outlier(plain, 5), huber=1.345)
     analysis = assimilate(problem, AssimilationSettings(members=48), 1)
     a = np.linspace(0.7, 1.3, 6001)
@@ -303,11 +303,11 @@ def test_what_cannot_be_combined_is_refused():
     settings = AssimilationSettings(scheme="es-mda", members=8)
     for options in ({"huber": 1.345}, {"sigma": 0.5}):
         with pytest.raises(ConfigError, match="es-mda"):
-            assimilate(with_errors(make_problem(Linear(NAMES), TRUTH), **options), settings, 1)
+            assimilate(with_errors(make_problem(Vectorised(NAMES), TRUTH), **options), settings, 1)
 
 
 def test_es_mda_with_correlated_errors_is_the_smoother():
-    problem = with_errors(make_problem(Linear(NAMES), TRUTH), correlation=block(K))
+    problem = with_errors(make_problem(Vectorised(NAMES), TRUTH), correlation=block(K))
     settings = AssimilationSettings(scheme="es-mda", mda_form="square-root", members=20)
     analysis = assimilate(problem, settings, 1)
     h = jacobian(problem.model, problem.observations.times)
@@ -319,7 +319,7 @@ def test_es_mda_with_correlated_errors_is_the_smoother():
 
 def test_mean_and_anomalies_of_a_scaled_problem_do_not_depend_on_sigma():
     """σ is drawn from its own stream: the other parameters keep their members."""
-    plain = make_problem(Linear(NAMES), TRUTH)
+    plain = make_problem(Vectorised(NAMES), TRUTH)
     a, b = (p.prior.sample(10, 3, "random") for p in (plain, with_errors(plain, sigma=0.5)))
     assert np.array_equal(centre(a)[1], centre(b)[1][:, :3])
 
@@ -330,7 +330,7 @@ def test_numbers_of_any_kind_are_observations(kind):
         return numbers.tolist() if kind is list else numbers.astype(kind)
 
     times, values, ones = np.arange(1.0, 8.0), np.arange(3.0, 10.0), np.ones(7)
-    problem = make_problem(Linear(), np.ones(2))
+    problem = make_problem(Vectorised(), np.ones(2))
     floats = replace(problem, observations=Observations(times, values, noise_of(ones), ones))
     others = replace(problem, observations=Observations(of(times), of(values), noise_of(of(ones)), of(ones)))
     one, other = (assimilate(p, AssimilationSettings(members=8), seed=1) for p in (floats, others))

@@ -371,7 +371,7 @@ def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
     assert "nan" not in "".join(Page(html).text).split()
 
 
-def test_single_parameter_has_no_pairs(write_run, analysis):
+def test_single_parameter_has_no_pairs(write_run, analysis, monkeypatch):
     one = replace(
         with_parameters(analysis, analysis.parameters[0]),
         prior=analysis.prior[:, :1],
@@ -382,6 +382,9 @@ def test_single_parameter_has_no_pairs(write_run, analysis):
         iterations=tuple(replace(r, members=r.members[:, :1], centre=r.centre[:1]) for r in analysis.iterations),
     )
     run_dir = write_run(one)
+    two = tuple(figure for figure in FIGURES if figure[0] in ("posterior", "pairs"))
+    assert len(two) == 2
+    monkeypatch.setattr("en4dvar.report.figures.FIGURES", two)
     write_pages(run_dir, files=True)
     assert not (run_dir / "figures" / "pairs.pdf").exists()
     assert (run_dir / "figures" / "posterior.pdf").exists()

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Decay, Fragile, Linear, Toy, make_problem
+from toys import Decay, Fragile, Toy, Vectorised, make_problem
 
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis.diagnostics import effective_share, is_non_gaussian
@@ -67,7 +67,7 @@ def test_emulator_of_cubic_predictions_is_j_itself(level):
 
 
 def test_emulator_of_an_estimated_noise_scale():
-    base = make_problem(Linear(("a", "b")), [1.0, 0.5], k=20)
+    base = make_problem(Vectorised(("a", "b")), [1.0, 0.5], k=20)
     prior = replace(base.prior, terms=(*base.prior.terms, PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4)))
     problem = replace(base, prior=prior)
     emulator = emulated(problem)
@@ -77,7 +77,7 @@ def test_emulator_of_an_estimated_noise_scale():
 
 def test_walkers_stay_where_data_narrow_a_lot():
     """Six parameters of a linear model; against the posterior in closed form. The prior has e^41 times its volume."""
-    std, problem = 0.002, make_problem(Linear(tuple("abcdef")), [1.0, 0.5, 0.2, 0.9, 0.4, 0.7], std=0.002, k=40)
+    std, problem = 0.002, make_problem(Vectorised(tuple("abcdef")), [1.0, 0.5, 0.2, 0.9, 0.4, 0.7], std=0.002, k=40)
     prior, readings = problem.prior, problem.observations.values
     at = forecast(problem, np.vstack([prior.mean, prior.mean + np.eye(6)])).predictions
     H = (at[1:] - at[0]).T
@@ -189,7 +189,7 @@ def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
 
 
 def test_a_gaussian_posterior_costs_no_more_runs_than_it_has_members():
-    problem = make_problem(Linear(("a", "b"), compiled=True), [1.0, 0.5])
+    problem = make_problem(Vectorised(("a", "b"), compiled=True), [1.0, 0.5])
     analysis = assimilate(problem, AssimilationSettings(), 1)
     tails = {"tail_shift", "tail_ratio", "tail_excess", "tail_members", "tail_elsewhere"}
     assert set(analysis.shape) == {"gaussian_fit", "non_gaussian"} | tails

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cut_anywhere import assert_cut_anywhere
 from same_bits import assert_same_bits
-from toys import Decay, Fragile, Linear, Vectorised, Wave, make_problem
+from toys import Decay, Fragile, Vectorised, Wave, make_problem
 
 from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.sampling import mcmc
@@ -42,7 +42,7 @@ def gap(actual, expected):
 @pytest.mark.parametrize("sampling", ["exact", "random"])
 @pytest.mark.parametrize("weights", [1.0, 1 / 9])
 def test_square_root_form_is_one_update_of_a_linear_model(coefficients, sampling, weights):
-    problem = make_problem(Linear(NAMES), TRUTH, weights=weights)
+    problem = make_problem(Vectorised(NAMES), TRUTH, weights=weights)
     analysis = run(problem, "square-root", coefficients, sampling=sampling)
     mean, cov = kalman(analysis, problem)
     assert gap(analysis.posterior.mean(axis=0), mean) < 1e-12
@@ -53,7 +53,7 @@ def test_square_root_form_is_one_update_of_a_linear_model(coefficients, sampling
 
 
 def test_perturbed_form_once_has_the_mean_of_the_kalman_update():
-    problem = make_problem(Linear(NAMES), TRUTH)
+    problem = make_problem(Vectorised(NAMES), TRUTH)
     analysis = run(problem, "perturbed", (1.0,))
     assert gap(analysis.posterior.mean(axis=0), kalman(analysis, problem)[0]) < 1e-12
 
@@ -115,7 +115,7 @@ def test_mild_nonlinearity(form):
 @pytest.mark.parametrize("form", ["perturbed", "square-root"])
 def test_failed_members_follow_the_regression_on_the_survivors(form):
     """For a linear model the regression is exact, so that losing members changes nothing but rounding."""
-    whole = run(make_problem(Linear(), [1.0, 0.5]), form, members=30)
+    whole = run(make_problem(Vectorised(), [1.0, 0.5]), form, members=30)
     limit = np.sort(whole.prior[:, 0])[-4]
     problem = make_problem(Fragile(limit), [1.0, 0.5])
     analysis = run(problem, form, members=30)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from toy_config import write_toy
 
 import en4dvar
 from en4dvar.plumbing.errors import ConfigError
 
-QUICK_START = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+TESTS = Path(__file__).resolve().parents[1]
 SCHEME = """
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -55,12 +56,11 @@ def package(tmp_path):
         (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
         lines = "".join(f"{key} = {value}\n" for key, value in entries.items())
         (about / "entry_points.txt").write_text(f"[en4dvar.schemes]\n{lines}")
-    config = yaml.safe_load(QUICK_START.read_text(encoding="utf-8"))
-    config["data"]["path"] = str(QUICK_START.parent / config["data"]["path"])
+    config = yaml.safe_load(write_toy(tmp_path).read_text(encoding="utf-8"))
     config["output"] = {"report": False}
     config["assimilation"] = {"scheme": "patient", "patience": 4, "members": 16, "what_if": False}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(TESTS), os.environ.get("PYTHONPATH", "")])}
 
 
 def called(*words, environment, folder):
@@ -75,7 +75,7 @@ def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "cannot be loaded" not in done.stderr
     assert "not a subclass" not in done.stderr
-    resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
+    resolved = yaml.safe_load((tmp_path / "runs" / "toy" / "config.resolved.yaml").read_text())
     assert resolved["assimilation"]["scheme"] == "patient"
     assert resolved["assimilation"]["patience"] == 4
     text = (tmp_path / "own.yaml").read_text()
@@ -134,8 +134,10 @@ def test_a_scheme_that_gives_no_step_is_named(package, tmp_path, line, words):
 def test_a_file_serves_as_well(package, tmp_path):
     """``scheme: ./file.py:Class``, of the data of one set, in other processes, and of a series."""
 
+    found = {**os.environ, "PYTHONPATH": package["PYTHONPATH"].partition(os.pathsep)[2]}  # the scheme in the file alone
+
     def cli(*words):
-        return called("-m", "en4dvar.cli", *words, environment=dict(os.environ), folder=tmp_path)
+        return called("-m", "en4dvar.cli", *words, environment=found, folder=tmp_path)
 
     own = (tmp_path / "own.yaml").read_text().replace("scheme: patient", "scheme: ./patient.py:Patient")
     for old, new, words in (
@@ -154,7 +156,7 @@ def test_a_file_serves_as_well(package, tmp_path):
         done = cli(*verb)
         assert done.returncode == 0, done.stderr
         assert "no posterior" not in done.stderr
-    resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
+    resolved = yaml.safe_load((tmp_path / "runs" / "toy" / "config.resolved.yaml").read_text())
     assert resolved["assimilation"]["scheme"] == f"{tmp_path / 'patient.py'}:Patient"
     assert resolved["assimilation"]["patience"] == 4
     (tmp_path / "slow.py").write_text("from en4dvar.schemes import ETKF\nclass Slow(ETKF):\n    words = 'slow'\n")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from syntax import nodes
 from toys import Decay, make_problem
 
 from en4dvar import AssimilationSettings
@@ -169,9 +170,8 @@ def test_no_scheme_is_named_outside_its_folder() -> None:
 
 def strings(source: str) -> list[str]:
     """Texts of a file but those that describe a module, class, function or key."""
-    tree = ast.parse(source)
-    described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in described]
+    described = {id(node.value) for node in nodes(source) if isinstance(node, ast.Expr)}
+    constants = [node for node in nodes(source) if isinstance(node, ast.Constant) and id(node) not in described]
     return [node.value for node in constants if isinstance(node.value, str)]
 
 

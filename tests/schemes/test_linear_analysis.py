@@ -50,7 +50,7 @@ def close(actual, expected, tolerance):
 @pytest.mark.parametrize("step_control", ["full", "line-search", "levenberg-marquardt"])
 @pytest.mark.parametrize("weights", [1.0, 1 / 9])
 def test_one_iteration_is_the_kalman_smoother(linearisation, sampling, start, step_control, weights):
-    problem = make_problem(Linear(NAMES), TRUTH, weights=weights)
+    problem = make_problem(Vectorised(NAMES), TRUTH, weights=weights)
     analysis = run(problem, linearisation, sampling=sampling, start=start, step_control=step_control)
     h = jacobian(problem.model, problem.observations.times)
     mean, cov, dfs = kalman(analysis.prior, h, problem.observations.values, 0.01 / weights * np.eye(9))
@@ -65,7 +65,7 @@ def test_one_iteration_is_the_kalman_smoother(linearisation, sampling, start, st
 
 
 def test_exact_sampling_reproduces_the_analytic_posterior():
-    problem = make_problem(Linear(NAMES), TRUTH)
+    problem = make_problem(Vectorised(NAMES), TRUTH)
     h = jacobian(problem.model, problem.observations.times)
     precision = np.eye(3) + h.T @ h / 0.01
     mean = np.linalg.solve(precision, 0.8 * TRUTH + h.T @ problem.observations.values / 0.01)
@@ -77,7 +77,7 @@ def test_exact_sampling_reproduces_the_analytic_posterior():
 @pytest.mark.parametrize("n", [2, 3, 8])
 def test_control_space_larger_than_smaller_than_ensemble(n):
     names = tuple("abcdefgh"[:n])
-    problem = make_problem(Linear(names), np.linspace(1, 2, n))
+    problem = make_problem(Vectorised(names), np.linspace(1, 2, n))
     analysis = run(problem, sampling="random", members=5)
     h = jacobian(problem.model, problem.observations.times)
     mean, cov, _ = kalman(analysis.prior, h, problem.observations.values, 0.01 * np.eye(9))
@@ -118,7 +118,7 @@ def test_batching_is_invisible(linearisation):
 
 
 def test_member_order_permutes_the_posterior(monkeypatch):
-    problem = make_problem(Linear(NAMES), TRUTH)
+    problem = make_problem(Vectorised(NAMES), TRUTH)
     plain = run(problem)
     order = np.random.default_rng(2).permutation(20)
     sample = Prior.sample
@@ -145,7 +145,7 @@ class _Scaled(Linear):
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])
 def test_units_of_parameters_do_not_matter(linearisation):
     factors = np.array([1e-9, 1e6, 1.0])
-    plain = make_problem(Linear(NAMES), TRUTH)
+    plain = make_problem(Vectorised(NAMES), TRUTH)
     terms = tuple(
         PriorTerm.normal(t.parameter, t.mean * f, t.std * f) for t, f in zip(plain.prior.terms, factors, strict=True)
     )
@@ -181,7 +181,7 @@ def test_hessian_algebra(shape):
 
 
 def test_log_evidence_of_a_linear_gaussian_case():
-    problem = make_problem(Linear(NAMES), TRUTH)
+    problem = make_problem(Vectorised(NAMES), TRUTH)
     h = jacobian(problem.model, problem.observations.times)
     covariance = h @ h.T + 0.01 * np.eye(9)  # the prior has unit covariance
     r = problem.observations.values - h @ (0.8 * TRUTH)
@@ -215,7 +215,7 @@ def test_time_shift_reads_each_member_at_its_own_time():
 
 def test_an_offset_of_the_readings_is_an_error_that_they_share():
     """Estimated beside a model, it leaves the posterior of R + c² 11ᵀ; as a fixed number it is subtracted."""
-    problem, c, ones = make_problem(Linear(NAMES), TRUTH), 0.3, np.ones((9, 9))
+    problem, c, ones = make_problem(Vectorised(NAMES), TRUTH), 0.3, np.ones((9, 9))
     widened = replace(problem, prior=Prior((*problem.prior.terms, PriorTerm.normal(READING_OFFSET, 0.0, c))))
     analysis, h = run(widened, sampling="exact"), jacobian(problem.model, problem.observations.times)
     mean, cov, _ = kalman(analysis.prior[:, :3], h, problem.observations.values, 0.01 * np.eye(9) + c**2 * ones)
@@ -228,7 +228,7 @@ def test_an_offset_of_the_readings_is_an_error_that_they_share():
 
 
 def test_minimum_norm_start_has_the_background_of_the_member():
-    problem = make_problem(Linear(NAMES), TRUTH)
+    problem = make_problem(Vectorised(NAMES), TRUTH)
     analysis = run(problem, start="best-member", max_iterations=0, sampling="random")
     record, members = analysis.iterations[0], analysis.prior
     z = record.centre - members.mean(axis=0)
