@@ -128,7 +128,11 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Data file, folder or pattern instead of data.path.",
     )  # fmt: skip
     @click.option(
-        "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help="Set a value, e.g. assimilation.members=96; any number of times.",
     )
     @functools.wraps(command)
     def with_source(

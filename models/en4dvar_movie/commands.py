@@ -43,8 +43,8 @@ def track(
 ) -> None:  # fmt: skip
     """Read a bubble's radius and its error from each movie frame.
 
-    MOVIE is a TIFF stack, a folder of pictures, an mp4, avi or gif file, or a raw file with --raw. 'en4dvar init'
-    and 'en4dvar run' read the table as it is; a page shows every outline and what was left out.
+    MOVIE is a TIFF stack, a folder of pictures, an mp4, avi, mov, mkv, gif or cine file, or a raw file with --raw.
+    'en4dvar init' and 'en4dvar run' read the table as it is; a page shows every outline and what was left out.
 
     \b
     Example:

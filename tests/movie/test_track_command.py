@@ -14,6 +14,7 @@ from movies import movie_of
 from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
+from en4dvar_movie.frames import MOVING
 from en4dvar_movie.page import page_text
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.table import Scale, to_csv
@@ -195,3 +196,9 @@ def test_what_is_wrong_of_a_movie_is_said_of_the_command_that_was_typed(tmp_path
     assert "is the unit right?" in refused.output
     assert "init [OPTIONS]" in refused.output
     assert "track" not in refused.output
+
+
+def test_the_help_names_every_kind_of_movie_that_is_read():
+    """It left out cine, mov and mkv."""
+    told = " ".join(CliRunner().invoke(main, ["track", "--help"]).output.split())
+    assert [suffix for suffix in MOVING if suffix not in (".tif", ".tiff") and suffix[1:] not in told] == []
