@@ -21,7 +21,7 @@ from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.trust import Ask, recorded_config
 from en4dvar.sampling.modes import TOO_FEW
 
-CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
+CARRIED = ("implausible-data", "lost-frame", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
 
 
