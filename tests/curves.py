@@ -37,8 +37,7 @@ class Toy(ForwardModel):
     def initial_states(self, theta):
         """All at once, where curves take arrays, as those below do."""
         kind = type(self)
-        at_once = kind.of_arrays or kind.curve in (Linear.curve, Decay.curve, Wave.curve)
-        if kind.initial_state is not Toy.initial_state or not at_once:
+        if kind.initial_state is not Toy.initial_state or not (kind.of_arrays or kind.curve in ARRAYS):
             return super().initial_states(theta)
         values = np.stack([theta[p.name] for p in self.parameters])
         return np.stack([self.curve(values, 0.0), self.rate(values, 0.0), *values], axis=1)
@@ -65,7 +64,7 @@ class Closed(Toy):
 
     def trajectories(self, x, times):
         kind = type(self)
-        if kind.step is not Toy.step or kind.curve not in (Decay.curve, Wave.curve):
+        if kind.step is not Toy.step or not (kind.of_arrays or kind.curve in ARRAYS):
             return super().trajectories(x, times)
         own, theta = np.broadcast_to(times, (len(x), np.shape(times)[-1])), x[:, 2:]
         y, v = (np.broadcast_to(of(theta.T[..., None], own), own.shape) for of in (self.curve, self.rate))
@@ -96,6 +95,9 @@ class Wave(Closed):
     def rate(self, theta, t):
         a, b = theta
         return 3 * a * b * np.cos(3 * b * t)
+
+
+ARRAYS = (Linear.curve, Decay.curve, Wave.curve)
 
 
 class Fragile(Linear):

@@ -3,14 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from toys import Toy, make_observations, make_problem
+from toys import Closed, make_observations, make_problem
 
 from en4dvar.estimation.assimilate import log_posterior
-from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import PriorTerm
 
 
-class Wells(Toy):
+class Wells(Closed):
     """y = f(a) + b t with f(a) = a² (two wells alike) or, for a > 0, (3 a)² (one of them three times as narrow)."""
 
     narrow, of_arrays = False, True
@@ -21,12 +20,6 @@ class Wells(Toy):
 
     def rate(self, theta, t):
         return theta[1]
-
-    def trajectories(self, x, times):
-        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, len(self.parameters)))
-        parts = self.curve(theta.transpose(2, 0, 1), own), self.rate(theta.transpose(2, 0, 1), own)
-        return Batch(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), self.layout)
 
 
 class UnlikeWells(Wells):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Toy, Wave, make_problem, visit
+from toys import Closed, Decay, Toy, Wave, make_problem, visit
 
 from en4dvar.descent.step_control import LONGEST, Point, Tangent, Trials, acceleration, line_search, run_searches
 from en4dvar.descent.weight_space import WeightSpace
@@ -77,17 +77,17 @@ def test_the_sampled_prior_of_many_members_takes_no_square_of_them():
     assert peak < count**2  # bytes
 
 
-class Bend(Toy):
+class Bend(Closed):
     """y_k = a + (k-th power) curvature: a valley b = c a² that only a bent step follows; ``width`` is its width."""
 
-    width = 0.01
+    width, of_arrays = 0.01, True
 
     def curve(self, theta, t):
         a, b = theta
-        return float(a if t < 1.0 else (b - a * a) / self.width)
+        return np.where(t < 1.0, a, (b - a * a) / self.width)
 
     def rate(self, theta, t):
-        return 0.0
+        return 0.0 * theta[0] * t
 
 
 def test_bent_steps_follow_a_curved_valley():

@@ -9,7 +9,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.descent.step_control import LEAST, Settling
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.forward import ForwardModel, Observable, StateField, Trajectory
+from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -38,7 +38,7 @@ class Prey(ForwardModel):
         for k, then in enumerate(own[0]):
             u, now = self._after(u, rates, then - now), then
             states[:, k, :2] = np.exp(u)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
     def step(self, x, t0, t1):
         return np.concatenate([np.exp(self._after(np.log(x[None, :2]), x[None, 2:], t1 - t0)[0]), x[2:]])

@@ -7,11 +7,13 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
+from click.testing import CliRunner
 from diagnosis.provoked import TWO, Violent, run
-from run_files import configuration, make_campaign, run_cli
+from run_files import configuration, make_campaign
 from toy_config import csv_text, write_toy
 from toys import make_problem
 
+from en4dvar.cli import main
 from en4dvar.report.result import Result, load_result
 from en4dvar.runs.runner import run_campaign
 
@@ -61,7 +63,7 @@ def test_campaign_tells_them_by_data_set(campaign):
 
 def test_terminal_tells_what_was_found_and_what_to_do(tmp_path):
     path = write_toy(tmp_path, ("median: 3 N/m", "median: 9 N/m"))
-    told = run_cli("run", path, "--out", tmp_path / "run", "--no-report")
-    assert told.returncode == 0
+    told = CliRunner().invoke(main, ["run", str(path), "--out", str(tmp_path / "run"), "--no-report"])
+    assert told.exit_code == 0
     assert "make the prior of k about " in told.stderr
     assert "times as wide (parameters.k) and say so [prior-conflict]" in told.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toys import OBSERVABLE, Linear, make_observations, make_problem, with_discrepancy
+from toys import OBSERVABLE, Vectorised, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
 
 import en4dvar
@@ -69,7 +69,7 @@ def test_independent_errors_tell_nothing_of_the_rest():
 
 def test_bands_are_those_of_a_linear_model():
     """The predictive distribution of a linear model is Gaussian: N(H m, H C Hᵀ + std²), by the normal equations."""
-    model = Linear()
+    model = Vectorised()
     problem = continued(make_problem(model, (1.0, 0.5)), (1.0, 0.5), 1)
     a = assimilate(problem, AssimilationSettings(members=400), 1)
     rows = np.array([[model.curve(e, t) for e in np.eye(2)] for t in np.append(problem.observations.times, LATER)])
@@ -115,21 +115,21 @@ def test_nine_in_ten_readings_lie_in_their_bands():
     inside = []
     for seed in range(40):
         truth = np.array([0.8, 0.4]) + np.random.default_rng([3, seed]).standard_normal(2)
-        prior = make_problem(Linear(), (1.0, 0.5)).prior.terms
-        problem = continued(make_problem(Linear(), truth, seed=seed, prior=prior), truth, seed)
+        prior = make_problem(Vectorised(), (1.0, 0.5)).prior.terms
+        problem = continued(make_problem(Vectorised(), truth, seed=seed, prior=prior), truth, seed)
         inside.append(assimilate(problem, SETTINGS, seed).withheld.inside)
     assert 0.84 < np.mean(inside) < 0.96
 
 
 def test_without_readings_after_the_window_there_is_nothing():
-    problem = make_problem(Linear(), (1.0, 0.5))
+    problem = make_problem(Vectorised(), (1.0, 0.5))
     assert predict_withheld(problem, np.zeros((4, 2)), SerialExecutor()) is None
     assert assimilate(problem, SETTINGS, 1).withheld is None
 
 
 def test_written_read_back_and_shown(tmp_path):
     """Also beside a discrepancy, whose members have an amplitude and a length each."""
-    plain = make_problem(Linear(), (1.0, 0.5))
+    plain = make_problem(Vectorised(), (1.0, 0.5))
     problem = with_discrepancy(plain)
     y = problem.observations
     times, std = np.append(y.times, LATER), np.full(len(y) + 7, 0.1)

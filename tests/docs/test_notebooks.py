@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import pytest
 from doc_pages import ROOT
 
@@ -20,6 +19,8 @@ def session(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[st
     for cell in json.loads((ROOT / "docs" / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), names)
+    import matplotlib.pyplot as plt  # every worker reads the head of this file, and this takes a second
+
     plt.close("all")
     return names
 

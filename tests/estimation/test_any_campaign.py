@@ -13,7 +13,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.population.own import own_draws
 from en4dvar.executor import ProcessesExecutor
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.sweep import SweepSettings, run_sweep
@@ -63,7 +63,7 @@ class Spiked(Vectorised):
         y = np.sqrt(np.maximum(-2 * np.logaddexp(*logs), 0.0))
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         states = np.stack([np.stack([y, 0 * y, *theta.T], axis=1)] * own.shape[1], axis=1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
     def exact(self):
         return sum(a * (np.sqrt(2 * np.pi) * w * norm(c, np.hypot(1, w)).pdf(0.0)) ** 2 for a, c, w in self.parts)

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.special import ndtr
 from toy_config import csv_text, write_toy
-from toys import Linear, make_observations
+from toys import Vectorised, make_observations
 
 import en4dvar
 from en4dvar.assembly.build import build
@@ -53,7 +53,7 @@ def test_the_score_is_the_derivative_of_the_cost():
 
 
 def _problem(sides, values, std):
-    model = Linear(names=("a",))  # y = a
+    model = Vectorised(names=("a",))  # y = a
     plain = make_observations(np.arange(1.0, 1.0 + len(values)), np.array(values), std=std)
     data = type(plain)(plain.times, plain.values, noise_of(plain.std, sides=np.array(sides)), plain.weights)
     return InverseProblem(model, model.observables[0], data, Prior((PriorTerm.normal(model.parameters[0], 0.0, 1.0),)))

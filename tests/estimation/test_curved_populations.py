@@ -13,7 +13,7 @@ from toys import Toy, Vectorised, make_problem
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.population import HyperPrior, Population, population_of
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import Prior, PriorTerm
 
 SETS, ERRORS, STD = 8, np.array([0.1, 0.5]), np.array([0.8, 0.6])  # errors of the readings, std of the prior of a and b
@@ -56,7 +56,7 @@ class TwoReadings(Toy):
         first, second = self.pair(x[:, 2, None], x[:, 3, None])
         y = np.where(own < 0.5, first, second)
         states = np.stack([y, 0 * y, *np.broadcast_to(x[:, 2:].T[..., None], (2, *y.shape))], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from en4dvar.estimation.joint import estimate, members
 from en4dvar.estimation.joint.descent import Arrow, Experiment, JointDescent, JointObjective, Place
 from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
 from en4dvar.executor import SerialExecutor
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -162,7 +162,7 @@ class Bent(Vectorised):
         y = np.broadcast_to((x[:, 3] + 0.8 * np.expm1(x[:, 2]))[:, None], own.shape)
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
         states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 class Steep(Bent):
@@ -242,7 +242,7 @@ class Rounded(Vectorised):
         y = x[:, 2, None] * own + x[:, 3, None] ** 2
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
         states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 @pytest.mark.slow
@@ -276,7 +276,7 @@ class Decaying(Vectorised):
         y = self.of(*x[:, 2:].T[..., None], own)
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 3))
         states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 @pytest.mark.slow
@@ -316,7 +316,7 @@ class Folded(Vectorised):
         y = a * own + c**2 + 0.1 * c * own
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
         states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():

@@ -11,7 +11,7 @@ from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObje
 from en4dvar.estimation.joint.members import Proposal, _moments
 from en4dvar.estimation.joint.problem import Single
 from en4dvar.executor import SerialExecutor
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
@@ -53,7 +53,7 @@ class Flat(Vectorised):
         values = np.hstack([x[:, 2:3], (x[:, 3:4] + 2) ** 2 - 9, 1e5 * x[:, 4:] ** 5])
         states = np.zeros((*own.shape, x.shape[1]))
         states[..., 0], states[..., 2:] = np.take_along_axis(values, own, axis=1), x[:, None, 2:]
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+        return Batch(own, states, self.layout)
 
 
 @pytest.mark.parametrize("seed", range(4))

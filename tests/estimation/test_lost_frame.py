@@ -16,7 +16,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty.advice import advised
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.lost_frame import _discrepant
-from en4dvar.model.forward import Trajectory
+from en4dvar.model.forward import Batch
 from en4dvar.plumbing.caution import caution, untrusted
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -36,7 +36,7 @@ class Tone(Toy):
         a, b = x[:, 2:3], x[:, 3:4]
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
         states = np.stack([a * np.cos(b * own), -a * b * np.sin(b * own)], axis=-1)
-        return [Trajectory(t, s, self.layout) for t, s in zip(own, np.concatenate([states, theta], -1), strict=True)]
+        return Batch(own, np.concatenate([states, theta], -1), self.layout)
 
     def initial_state(self, theta):
         return np.array([theta["a"], 0.0, theta["a"], theta["b"]])

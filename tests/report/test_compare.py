@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from run_files import add_to_pack
-from toys import Linear, make_problem
+from toys import Vectorised, make_problem
 
 from en4dvar.cli import main
 from en4dvar.diagnosis.diagnostics import member_quantiles
@@ -32,8 +32,8 @@ from en4dvar.schemes.settings import AssimilationSettings
 def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
     """Results of linear models with the first ``names`` of a, b; the data are those of y = a alone."""
     for seed in seeds:
-        problem = make_problem(Linear(("a",)), [1.0], seed=seed, std=std)
-        model = Linear(names)
+        problem = make_problem(Vectorised(("a",)), [1.0], seed=seed, std=std)
+        model = Vectorised(names)
         observations = replace(problem.observations, name=f"set{seed}")
         prior = Prior(tuple(PriorTerm.normal(p, 0.0, wide) for p in model.parameters))
         analysis = assimilate(InverseProblem(model, problem.observable, observations, prior), AssimilationSettings(), 1)
@@ -45,9 +45,9 @@ def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
 
 def exact_evidence(problem_seed, names, std=0.1, wide=1.0):
     """ln N(y; 0, H B Hᵀ + R) of the linear model."""
-    problem = make_problem(Linear(("a",)), [1.0], seed=problem_seed, std=std)
+    problem = make_problem(Vectorised(("a",)), [1.0], seed=problem_seed, std=std)
     y, t = problem.observations.values, problem.observations.times
-    model = Linear(names)
+    model = Vectorised(names)
     h = np.array([[model.curve(e, s) for e in np.eye(len(names))] for s in t])
     cov = wide**2 * h @ h.T + std**2 * np.eye(len(y))
     return float(-0.5 * (y @ np.linalg.solve(cov, y) + np.linalg.slogdet(2 * np.pi * cov)[1]))
