@@ -367,7 +367,7 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
         if isinstance(path, Trajectory):
             with suppress(DataError):
                 shift = look.lobe.t_max - lobe(times, path["R"]).t_max
-    if abs(shift) <= SAME_CLOCK:
+    if abs(shift) <= SAME_CLOCK and look.begin >= 0:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
     text = f"{math.floor(1e7 * min(shift, look.begin)) / 10:.9g} us"  # no reading lies before the pulse
     return Entry("time_zero", text, "puts the R_max of the guess on that of the data: enter the clock of your pulse")
