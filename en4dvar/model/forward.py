@@ -109,7 +109,7 @@ class Alternative:
     """The same experiment with one assumption changed: what a result would be then is told beside it.
 
     ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
-    observables and parameters, but for those that it has in addition and whose values are ``given``; ``values`` and
+    observables and parameters, but for those that it has in addition, whose values are ``constants``; ``values`` and
     ``times`` multiply the observations and their errors; ``parameters`` are factors of a parameter's value where it is
     fixed, of the centre of its prior where it is estimated. One about the readings of an ``observable`` is told where
     all readings are of that.
@@ -122,7 +122,7 @@ class Alternative:
     times: float = 1.0
     parameters: Mapping[str, float] = field(default_factory=dict)
     observable: str = ""
-    given: Mapping[str, float] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

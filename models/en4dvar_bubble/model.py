@@ -225,11 +225,11 @@ def alternatives(model: Dynamics) -> tuple[Alternative, ...]:
 
     None in whose equations a parameter of the model has no place.
     """
-    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model, a.given) == _names(model))
+    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model, a.constants) == _names(model))
 
 
-def _names(model: ForwardModel | Dynamics, given: Collection[str] = ()) -> list[str]:
-    said = {WALL_DISTANCE.name, *given}  # a wall's distance is stated with the wall itself
+def _names(model: ForwardModel | Dynamics, constants: Collection[str] = ()) -> list[str]:
+    said = {WALL_DISTANCE.name, *constants}  # a wall's distance is stated with the wall itself
     return [p.name for p in model.parameters if p.name not in said]
 
 
@@ -244,7 +244,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
     if stiffens := next((it for it in REGISTRY.values() if (type(model.law), NO_STIFFENING) in it.limits), None):
         words = f"the gel stiffened (law: {stiffens.name}, alpha: {STIFFENED:g})"
-        yield replace(changed("stiffening", words, law=stiffens()), given={ALPHA.name: STIFFENED})
+        yield replace(changed("stiffening", words, law=stiffens()), constants={ALPHA.name: STIFFENED})
     for name, key, factor, words in MEDIUM:
         if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
             of = "S" if name == "surface_tension" else name

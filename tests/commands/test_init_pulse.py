@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from init_files import call, proposed, rebounding
 
 from en4dvar.assembly.build import build
+from en4dvar.config import load_config
 from en4dvar.priors.prior import PriorTerm
 from en4dvar_bubble import simulate as bubble_path
 from en4dvar_bubble.driving import sine_burst
@@ -56,6 +58,10 @@ def test_a_gel_that_does_not_stiffen_is_within_what_is_proposed() -> None:
     stiffens = bubble_path("quadratic-kelvin-voigt", {**gel, "alpha": least}, times).R[0].values
     does_not = bubble_path("neo-hookean-kelvin-voigt", gel, times).R[0].values
     assert np.max(np.abs(stiffens / does_not - 1)[times < times[int(np.argmax(does_not))]]) < 0.01
+    (line,) = (it for it in Path("pulse.yaml").read_text().splitlines() if "alpha=0" in it)
+    said = shlex.split(line.lstrip("# "))
+    (problem,) = build(load_config(Path("pulse.yaml"), dict([said[said.index("--set") + 1].split("=")])))
+    assert problem.fixed["alpha"] == 0.0
 
 
 @pytest.mark.parametrize("gel", [SOFT, STIFF], ids=["soft", "stiff"])

@@ -211,7 +211,7 @@ def changed_problem(problem: InverseProblem, alternative: Alternative) -> Invers
     )
     observations = replace(o, values=alternative.values * o.values, times=alternative.times * o.times, noise=noise)
     fixed = {name: value * alternative.parameters.get(name, 1.0) for name, value in problem.fixed.items()}
-    fixed |= alternative.given
+    fixed |= alternative.constants
     return replace(problem, model=alternative.model or problem.model, observations=observations, fixed=fixed)
 
 
