@@ -174,7 +174,7 @@ class _Warnings:
             if count > MOST_NAMED:
                 which[0] = f"{count} of {self.sets} data sets, worst {which[0]}"
             who = " and ".join(", ".join(names) for names in (wholes, which) if names)
-            yield f"{worst.kind}: {who}: {worst.code}; {worst.advice}"
+            yield f"{worst.kind}: {who}: {worst if count == 1 else f'{worst.code}; {worst.advice}'}"
         if begun:
             codes = ", ".join(begun)
             yield f"note: the fits of the {self.sets} single data sets only begin the joint estimate: {codes}"

@@ -311,6 +311,11 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
     lines = "\n".join(told.lines())
     assert "the population of a, the population of b and 4 of 6 data sets, worst set0, set1, set2: misfit; " in lines
     assert "the population of a, the population of b: chain-not-converged; " in lines
+    one = _Warnings()
+    one.add("set1", [])
+    one.add("set2", [caution("lost-frame", "after the reading at 2 s")])
+    one.add("the population", [caution("lost-frame", "of single data sets, set2: after", "caution")], whole=True)
+    assert next(one.lines()).startswith("warning: the population and set2: after the reading at 2 s; look at")
     alone = _Warnings()
     alone.add("the population", [caution("chain-not-converged", "few draws")], whole=True)
     assert "the population: few draws" in "\n".join(alone.lines())
