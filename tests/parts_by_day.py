@@ -1,4 +1,4 @@
-"""Which of the slow tests ``.ci/run`` runs on a day: every one in six days, and every long one in twenty."""
+"""Which of the slow tests ``.ci/run`` runs on a day: every one in eight days, and every long one in twenty."""
 
 import hashlib
 
