@@ -106,8 +106,13 @@ def quantity(value: float, std: float, unit: str = "1") -> str:
 
 
 def range_words(low: float, high: float, std: float, unit: str = "1") -> str:
-    """``"2.6 … 3.0 kPa"``, with the decimals that the std calls for."""
-    return f"{number_like(low, std)} … {quantity(high, std, unit)}"
+    """``"2.6 … 3.0 kPa"``, with the decimals that the std calls for; a lower end above zero is not rounded to zero.
+
+    >>> range_words(2.6, 3.0, 0.12, "kPa"), range_words(4e-5, 0.0108, 0.004), range_words(-4e-5, 0.0108, 0.004)
+    ('2.60 … 3.00 kPa', '4×10⁻⁵ … 0.0108', '0.0000 … 0.0108')
+    """
+    least = number_like(low, std)
+    return f"{plain_number(low, 1) if low > 0 and not least.strip('0.') else least} … {quantity(high, std, unit)}"
 
 
 def power_of(mean: float, std: float) -> int:
