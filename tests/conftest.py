@@ -17,7 +17,7 @@ import hypothesis
 import numpy as np
 import pytest
 from chromium import browser  # noqa: F401  a fixture: one for all, since Playwright runs once in a process
-from parts_by_day import is_of_day
+from parts_in_turn import is_of_part
 from threadpoolctl import threadpool_limits
 
 from en4dvar.data.noise import noise_of
@@ -169,14 +169,14 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--day", type=int, help="an eighth of the tests, of the long ones a twentieth: those of this day")
+    parser.addoption("--turn", type=int, help="a twelfth of the tests, of the long ones a twentieth: those of a turn")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tests of the day that is asked for; :data:`FIRST`, files with long tests, then those with the most."""
+    """Keep the tests of the turn that is asked for; :data:`FIRST`, files with long tests, then those with the most."""
     long = {item.nodeid for item in items if item.get_closest_marker("long")}
-    if (day := config.getoption("--day")) is not None:
-        items[:] = [item for item in items if is_of_day(item.nodeid, day, 20 if item.nodeid in long else 8)]
+    if (turn := config.getoption("--turn")) is not None:
+        items[:] = [item for item in items if is_of_part(item.nodeid, turn, 20 if item.nodeid in long else 12)]
     tests, begun_first = Counter(item.path for item in items), {item.path for item in items if item.nodeid in long}
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], item.path not in begun_first, -tests[item.path]))
