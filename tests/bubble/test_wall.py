@@ -226,6 +226,7 @@ def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wal
         assert [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
 
 
+@pytest.mark.skipif(not MEASURED.exists(), reason="../shared/data/bubbles is not there")
 @pytest.mark.parametrize(
     "name", ["pa_01", "pa_13", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pa_05", "pa_15"))]
 )
