@@ -169,14 +169,14 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--turn", type=int, help="a twelfth of the tests, of the long ones a twentieth: those of a turn")
+    parser.addoption("--turn", type=int, help="a sixteenth of the tests, of the long ones a thirtieth: those of a turn")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep the tests of the turn that is asked for; :data:`FIRST`, files with long tests, then those with the most."""
     long = {item.nodeid for item in items if item.get_closest_marker("long")}
     if (turn := config.getoption("--turn")) is not None:
-        items[:] = [item for item in items if is_of_part(item.nodeid, turn, 20 if item.nodeid in long else 12)]
+        items[:] = [item for item in items if is_of_part(item.nodeid, turn, 30 if item.nodeid in long else 16)]
     tests, begun_first = Counter(item.path for item in items), {item.path for item in items if item.nodeid in long}
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], item.path not in begun_first, -tests[item.path]))

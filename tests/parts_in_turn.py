@@ -1,4 +1,4 @@
-"""Which of the slow tests ``.ci/run`` runs: another twelfth every three hours, and of the long ones a twentieth.
+"""Which of the slow tests ``.ci/run`` runs: another sixteenth every three hours, and of the long ones a thirtieth.
 
 On each day there are several changes, and parts by the day were the same for all of them.
 """

@@ -85,6 +85,7 @@ def test_the_predicted_change_is_that_of_a_fit_done_again(fits, start, name):
     assert shift.cost_change == pytest.approx(again.iterations[-1].cost - analysis.iterations[-1].cost, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_every_number_of_the_table_is_that_of_a_fit_done_again(fits, start):
     """Parameter by parameter: within 0.3 standard deviations or a quarter, and so in sign where it is more."""

@@ -120,6 +120,7 @@ def test_a_top_that_is_cut_off_and_scatters_is_told(per_collapse: float, ceiling
     assert told > 15
 
 
+@pytest.mark.slow
 def test_a_top_that_scatters_is_not_level() -> None:
     stream = np.random.default_rng(13)
     for _ in range(400):

@@ -48,6 +48,7 @@ def test_a_linear_problem_ends_where_it_does_without(correlated):
     assert with_and_without[1].forward_runs > with_and_without[0].forward_runs - 60
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_bits():
     problem, _ = chaotic(seed=3)
     assert_cut_anywhere(problem, AssimilationSettings(**OPTIONS, lengthen=4), 1, cuts=4)

@@ -186,6 +186,7 @@ class Ridge(Toy):
         return float(theta[0] + 2 * np.sin(3 * theta[0]))
 
 
+@pytest.mark.slow
 def test_where_no_start_explains_the_data_others_are_tried(monkeypatch):
     """Of thirty seeds a third find the truth from two starts, two thirds from others beside them; the rest ends at the
     maximum of the factor, 4.77, or beyond the next one.

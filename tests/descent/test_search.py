@@ -120,6 +120,7 @@ def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_
     assert "misfit" in {c.code for c in lost.cautions}
 
 
+@pytest.mark.slow
 def test_where_descents_scatter_draws_beyond_the_ensemble_settle_which_minimum_is_lowest():
     """Members alone end in a wrong minimum for five of these seeds, at a plausible J, for one of them twice."""
     for seed in range(8):
@@ -182,6 +183,7 @@ def test_a_search_goes_on_to_the_same_bits():
         assert_cut_anywhere(problem, AssimilationSettings(start="prior-mean"), seed, cuts=25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refine", ["none", "auto"])
 def test_a_descent_from_where_nothing_changes_goes_on_to_the_same_bits(refine):
     model, times = Ramp(), np.linspace(0.25, 5.0, 20)
@@ -228,6 +230,7 @@ def told_last(heard):
     return [record.cost for record in told[begins[-1] :]], len(begins)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("accepted", [True, False])
 def test_the_iterations_told_last_are_those_of_the_accepted_descent(monkeypatch, accepted):
     """Also where the other descent is given up, which is told as well."""
@@ -308,7 +311,8 @@ def alone(monkeypatch):
     monkeypatch.setattr("en4dvar.estimation.stages.weighs", lambda space: False)  # nor do members of the prior tell it
 
 
-@pytest.mark.parametrize("kind", [Parting, pytest.param(UnlikeParting, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Parting, UnlikeParting])
 def test_readings_after_the_window_lead_to_a_minimum_that_was_missed(kind, monkeypatch):
     """The well that they are of is found; the posterior is that of the window alone, by a grid."""
     alone(monkeypatch)

@@ -45,6 +45,7 @@ def experiment(model: Toy, i: int) -> InverseProblem:
     return InverseProblem(model, problem.observable, problem.observations, problem.prior)
 
 
+@pytest.mark.slow
 def test_solver_noise_is_no_lack_of_convergence_and_no_wrong_spread():
     settings = AssimilationSettings(members=12)
     told, shifts, ratios = [], [], []

@@ -162,6 +162,7 @@ def test_a_model_of_states_with_a_rate(changes):
     assert np.max(np.abs(found[0].posterior - found[1].posterior) / std) < 1e-4
 
 
+@pytest.mark.slow
 def test_same_bits_in_processes_and_after_an_interruption():
     problem, settings = ten(), AssimilationSettings(what_if=False)
     whole = assert_cut_anywhere(problem, settings, 1, cuts=4)

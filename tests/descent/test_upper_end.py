@@ -24,7 +24,8 @@ def ratios(n, k, seed, truth=1.0):
     return member_quantiles(cosines_estimated(n, y, STD, seed).posterior["sigma"].values.ravel(), levels) / exact
 
 
-@pytest.mark.parametrize(("n", "k"), [(12, 14), pytest.param(8, 12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "k"), [(12, 14), (8, 12)])
 def test_ends_of_the_noise_scale_are_those_of_its_posterior(n, k):
     """Draws of the noise scale in no order, and mixed with the other parameters', leave the ends off by 7 to 14 %."""
     logs = np.log([ratios(n, k, seed) for seed in range(8)])

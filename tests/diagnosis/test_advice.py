@@ -275,6 +275,7 @@ def test_a_table_that_is_not_there_is_asked_for_and_one_that_cannot_be_is_not_na
     assert "look at the what-if table and compare other models" in told(there, "discrepancy-found").advice
 
 
+@pytest.mark.slow
 def test_what_the_model_says_may_change_is_let_change_where_a_long_window_shows_a_discrepancy():
     """A window with one maximum behind the first minimum, or several; or in which it changes already."""
     problem = waved(3.0)
@@ -301,7 +302,8 @@ def late(kind: str, seed: int) -> InverseProblem:
     return with_discrepancy(read(p, values=values), **wide, smoothness=1.5, sigma=0.4, grows_beyond=3.0)
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 12), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [range(2), range(2, 12)])
 def test_errors_of_the_times_are_told_from_what_the_model_misses(seeds):
     """Both are largest where the observable changes fast; a model that errs does so alike at neighbours."""
     told_by = [run(late("each", seed)) for seed in seeds]
@@ -317,8 +319,9 @@ def test_errors_of_the_times_are_told_from_what_the_model_misses(seeds):
             assert again is None or again.advice != c.advice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["slowly", "another"])
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 8), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(2), range(2, 8)])
 def test_no_errors_of_the_times_are_seen_in_what_the_model_misses(kind, seeds):
     assert [run(late(kind, seed)).timing for seed in seeds] == [0.0] * len(seeds)
 
@@ -336,6 +339,7 @@ def test_a_wrong_reading_is_no_error_of_the_times():
         assert analysis.timing == 0.0
 
 
+@pytest.mark.slow
 def test_errors_of_the_times_that_are_stated_too_large_are_named():
     """Of a clock that keeps time; an exposure is asked for where nothing is said of times."""
     p = make_problem(Wave(), (1.0, 2.0), k=80, std=0.002, time_std=0.1)
@@ -348,6 +352,7 @@ def test_errors_of_the_times_that_are_stated_too_large_are_named():
     assert "give its --exposure" in told(run(plain), "prior-conflict").advice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [0.1, 0.3])
 def test_no_warning_asks_for_larger_errors_of_the_times_beside_one_that_asks_for_smaller_ones(stated):
     """A wave that the model misses, read by a clock that keeps time better than is stated."""
@@ -360,6 +365,7 @@ def test_no_warning_asks_for_larger_errors_of_the_times_beside_one_that_asks_for
     assert not any("larger data.error.time_std" in c.advice for c in a.cautions)
 
 
+@pytest.mark.slow
 def test_errors_of_the_times_that_explain_the_residuals_are_not_said_to_be_stated_too_large(monkeypatch):
     monkeypatch.setattr(conclusions, "timing_of", lambda *_: 0.5)
     p = make_problem(Wave(), (1.0, 2.0), k=80, std=0.002, time_std=0.1)

@@ -93,6 +93,7 @@ def test_a_curved_model_finds_its_minimum():
     assert each[1].posterior.std(axis=0) == pytest.approx(std, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_same_bits_for_any_worker_count():
     _, problem = patchy(Vectorised(NAMES), TRUTH)
     alone = assimilate(problem, settings(), 4, SerialExecutor())

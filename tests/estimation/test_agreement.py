@@ -89,6 +89,7 @@ def test_the_others_of_an_odd_data_set_are_judged_without_it():
     assert [c.words[:14] for c in told] == ["without set4: "]
 
 
+@pytest.mark.slow
 def test_clean_campaigns_name_none_and_their_squares_follow_chi_squared():
     found = [joint(campaign([0.0] * 5, seed)) for seed in range(12)]
     agreed = [one.agreement for one in found]

@@ -69,6 +69,7 @@ class Spiked(Vectorised):
         return sum(a * (np.sqrt(2 * np.pi) * w * norm(c, np.hypot(1, w)).pdf(0.0)) ** 2 for a, c, w in self.parts)
 
 
+@pytest.mark.slow
 def test_the_wide_mode_counts_not_the_lowest_spike():
     model = Spiked()
     ones = np.ones(1)

@@ -242,6 +242,7 @@ def line(p, t):
     return p["a"] + p["b"] * t
 
 
+@pytest.mark.slow
 def test_a_range_is_two_series_of_one_observable(tmp_path):
     """As docs/several_series.md writes it, against quadrature of a line through six of them, one open above."""
     a, b = np.meshgrid(np.linspace(-5, 5, 1001), np.linspace(-2, 2, 1001), indexing="ij")

@@ -121,7 +121,8 @@ def truths(spread, count=SETS, seed=1):
     return 1.0 + spread * np.random.default_rng(seed).standard_normal(count)
 
 
-@pytest.mark.parametrize("spread", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [0.0, 0.5])
 def test_what_is_common_does_not_average_out(spread):
     problems = campaign(truths(spread))
     kept = known(problems, 0) if spread else ()
@@ -321,6 +322,7 @@ def test_a_few_that_are_sure_do_not_outweigh_many_others():
     assert median_of(middle, std, member_stream(1, "a"))[0] < 0.6
 
 
+@pytest.mark.slow
 def test_the_median_of_soft_gels_is_not_pulled_to_the_stiffest():
     """A modulus of 2.5 ± 0.7 kPa and a wide prior of its logarithm: low values have wide posteriors of it."""
     rng, grid, inside = np.random.default_rng(3), np.linspace(-6, 5, 800), []

@@ -74,7 +74,7 @@ def test_where_what_is_common_is_all_there_is():
     assert np.isfinite(Hierarchy(likelihoods, HYPER).log_density(h)).all()
 
 
-@pytest.mark.parametrize(("level", "seed"), [(0.25, 1), (3.0, 3)])
+@pytest.mark.parametrize(("level", "seed"), [(0.25, 1), pytest.param(3.0, 3, marks=pytest.mark.slow)])
 def test_what_adds_to_a_positive_parameter_is_that_of_quadrature(level, seed):
     """The common quantity is as large as the softest level: with slopes of ln G its 95 % would be twice as large."""
     likely = likelihoods_on_grid(level, seed)
@@ -85,6 +85,7 @@ def test_what_adds_to_a_positive_parameter_is_that_of_quadrature(level, seed):
     np.testing.assert_allclose(ours, exact, rtol=0, atol=0.06 * (exact[2] - exact[0]))
 
 
+@pytest.mark.slow
 def test_the_difference_of_two_gels_is_not_that_of_their_common_error():
     """Both e^{sν} rise with θ by as much, so that their difference is known well though each is not."""
     centres, of_each = [], []

@@ -131,6 +131,7 @@ def test_a_discrepancy_of_the_model(log_std, tmp_path):
     assert found.rows[0].result.gain == pytest.approx(exact, abs=1e-3 if log_std < 1 else 0.6)
 
 
+@pytest.mark.slow
 def test_chosen_readings_tell_more_than_as_many_at_a_fixed_rate(tmp_path):
     chosen = {"times": {"from": "0.1 s", "to": "2.5 s", "step": "0.1 s"}, "knobs": {}, "choose": {"readings": 6}}
     found, _ = run_design(_plan(**chosen), out=tmp_path / "chosen")
@@ -345,6 +346,7 @@ def test_the_shipped_linear_plan_is_the_closed_form(tmp_path):
     assert len(found.rows) == 7
 
 
+@pytest.mark.slow
 def test_two_rates_one_after_the_other(tmp_path):
     times = {"from": "0.5 s", "to": "1 s", "step": "0.1 s", "then": {"to": "2 s", "step": "0.5 s"}}
     knobs = {"late": {"key": "design.times.then.step", "values": ["0.25 s"]}}

@@ -101,6 +101,7 @@ def test_a_damaged_file_is_refused(campaign, tmp_path):
         load_joint(path)
 
 
+@pytest.mark.slow
 def test_discrepancies_of_their_own(tmp_path):
     """Draws of a Matérn process, whose amplitude and length are each data set's own, hide the shared spring little."""
     rng, path = np.random.default_rng(2), make_campaign(tmp_path, n=3)

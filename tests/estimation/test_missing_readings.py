@@ -185,6 +185,7 @@ def joint(gaps, executor=None):
     return estimate_jointly(shared, settings, 1, executor)
 
 
+@pytest.mark.slow
 def test_a_joint_estimate_is_that_without_gaps():
     whole, gappy = joint(False), joint(True)
     width = whole.shared.std(axis=0)

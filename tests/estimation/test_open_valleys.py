@@ -33,6 +33,7 @@ def seen(a, b, theta):
     return 2 * a + 1.4 * b, 1.4 * b
 
 
+@pytest.mark.slow
 def test_what_is_common_may_act_otherwise_along_a_valley():
     """With one slope for all of it the standard deviations are 0.6 and 0.5 of the exact ones."""
     hyper, rng = HyperPrior(1.0, SPREAD, odd=0.0), np.random.default_rng(4)
@@ -60,6 +61,7 @@ def test_what_is_common_may_act_otherwise_along_a_valley():
         assert nu[:, k].mean() == pytest.approx(mean, abs=0.3 * std)
 
 
+@pytest.mark.slow
 def test_draws_of_what_an_emulator_says_of_a_valley_are_many():
     base, model = make_problem(Vectorised(), [0.0, 0.0]), TwoReadings(bent)
     prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))

@@ -83,6 +83,7 @@ def test_a_mean_in_the_tails_of_all_is_where_quadrature_has_it():
     assert np.sqrt(np.mean(np.square(evidence))) < 0.5
 
 
+@pytest.mark.slow
 def test_draws_that_tell_the_mean_are_not_taken_anew():
     problems, likely, kept = campaign(1.0, 0.5, 0, 8)
     estimated = population(problems, kept)
@@ -102,6 +103,7 @@ def test_an_odd_data_set_is_named_where_the_others_are_drawn_anew():
     assert np.median(estimated.posterior.nu) == pytest.approx(exact[1], abs=0.5 * (exact[2] - exact[0]) / 3.3)
 
 
+@pytest.mark.slow
 def test_draws_taken_anew_are_the_same_on_any_workers():
     problems, _, kept = campaign(2.0, 1.4, 3, 5)
     apart = []
@@ -112,8 +114,9 @@ def test_draws_taken_anew_are_the_same_on_any_workers():
     np.testing.assert_array_equal(apart[0].posterior.nu, apart[1].posterior.nu)
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(10, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("least", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [5, 10])
+@pytest.mark.parametrize("least", [0.0, 0.3])
 def test_upper_limits_add_up_to_what_they_say(count, least):
     """Above a limit the likelihood falls to ``least`` of what it is below."""
     apart, width = [], []

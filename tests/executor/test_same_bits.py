@@ -41,7 +41,8 @@ def test_campaign_on_any_executor(quiet, tmp_path, kind, workers):
     assert_same_results(tmp_path / "run", run)
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["threads", "processes", "dask"])
 def test_members_on_workers_where_data_sets_are_few(few, tmp_path, kind):
     path, run = few
     config = configuration(path, tmp_path / "run", executor=kind, workers=3)

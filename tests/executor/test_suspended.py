@@ -22,6 +22,7 @@ def naps(tell):
     return within_time_limit(batch)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="a system without it")
 def test_a_batch_that_was_suspended_is_not_past_its_time():
     def suspend(_, worker):

@@ -384,6 +384,7 @@ def test_a_frame_of_a_folder_that_is_too_large(tmp_path: Path) -> None:
         list(open_movie(tmp_path).frames())
 
 
+@pytest.mark.slow
 def test_the_child_ends_with_its_parent(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "m.tif", np.zeros((2, 32, 32), np.uint8), photometric="minisblack")
     code = (

@@ -118,6 +118,7 @@ def besieged(quiet, folder, monkeypatch, damages, seed, many):
     return hit
 
 
+@pytest.mark.slow
 @pytest.mark.fault("pack-damaged")
 def test_no_set_vanishes_from_a_damaged_pack(quiet, tmp_path, monkeypatch):
     assert besieged(quiet, tmp_path, monkeypatch, (flip_in_a_line, flip, cut, zero, take_out), 1, 5)

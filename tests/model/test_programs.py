@@ -180,6 +180,7 @@ def test_a_rerun_asks_before_it_runs_a_program(folder, monkeypatch):
     assert "curve.py" in questions[0]
 
 
+@pytest.mark.slow
 def test_a_program_that_has_changed_is_another_run(folder, monkeypatch):
     monkeypatch.chdir(folder)
     program = folder / "own.py"

@@ -33,9 +33,8 @@ def drifting(across, down, structure=8.0, seed=3, drift=True):
     return shown
 
 
-@pytest.mark.parametrize(
-    ("across", "down"), [pytest.param(0.3, 0.15, marks=pytest.mark.slow), (-0.4, 0.3), (0.0, -0.8)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("across", "down"), [(0.3, 0.15), (-0.4, 0.3), (0.0, -0.8)])
 def test_radii_are_read_before_a_background_that_drifts(across, down):
     found = track(movie_of(drifting(across, down)))
     off = np.array([r.radius for r in found.readings[BEFORE:]]) - RADII

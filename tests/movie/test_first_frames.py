@@ -65,11 +65,12 @@ def test_a_large_bubble_of_the_first_frames_is_no_background(shape, ratio, uprig
     assert abs(np.mean(rest) / 22 - 1) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "radii",
     [
-        pytest.param(COLLAPSE, marks=pytest.mark.slow),
-        pytest.param(COLLAPSE[::-1], marks=pytest.mark.slow),
+        COLLAPSE,
+        COLLAPSE[::-1],
         [95.0] * 2 + [40.0] * 20 + [30.0] * 3,
     ],
 )
@@ -82,11 +83,12 @@ def test_empty_frames_before_a_bubble_that_the_frame_cuts_are_the_background(rad
 MOSTLY_COVERED = [*(90 * (1 - np.linspace(0, 0.97, 20) ** 2) ** 0.5), 30.0, 50, 64, 70, 71, 70, 64, 52, *[60.0] * 32]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "off"),
     [
-        pytest.param((96, 144), (0, 0), marks=pytest.mark.slow),
-        pytest.param((112, 160), (10, 6), marks=pytest.mark.slow),
+        ((96, 144), (0, 0)),
+        ((112, 160), (10, 6)),
         ((64, 192), (-9, 2)),
     ],
 )
@@ -141,13 +143,12 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
     assert sum(r.used for r in result.readings) > 8
 
 
-@pytest.mark.parametrize(
-    "swing", [pytest.param(0.25, marks=pytest.mark.slow), 0.5, pytest.param(1.28, marks=pytest.mark.slow)]
-)  # to each side
+@pytest.mark.slow
+@pytest.mark.parametrize("swing", [0.25, 0.5, 1.28])  # to each side
 @pytest.mark.parametrize(("glare", "dirt"), [(0.0, 0.02), (0.37, 0.02), (0.37, 0.08)])
 @pytest.mark.parametrize(
     ("radius", "shape", "off"),
-    [(42.6, (127, 112), (0, 0)), pytest.param(25.0, (128, 160), (5, -4), marks=pytest.mark.slow)],
+    [(42.6, (127, 112), (0, 0)), (25.0, (128, 160), (5, -4))],
 )
 def test_a_bright_bubble_whose_edge_moves_by_half_a_pixel_is_no_aperture(radius, shape, off, glare, dirt, swing):
     radii = radius + swing * np.sin(np.arange(12) / 2)

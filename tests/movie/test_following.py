@@ -57,12 +57,14 @@ def test_what_looks_like_a_lamp_writing_light_or_a_wall_does_not_lose_the_bubble
     assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
 
 
+@pytest.mark.slow
 def test_a_lamp_that_flickers_does_not_make_a_bubble_bright():
     of = nasty("flicker", 8)
     assert np.isfinite(of["wrong"][of["good"].astype(bool)]).mean() > 0.9
 
 
-@pytest.mark.parametrize("kind", ["interlaced", pytest.param("two flashes", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["interlaced", "two flashes"])
 def test_frames_of_two_images_are_doubted(kind):
     filmed = film(kind, 2)
     radius, result = read(filmed)
@@ -73,6 +75,7 @@ def test_frames_of_two_images_are_doubted(kind):
     assert words.split(":")[0] in doubted(result.readings)
 
 
+@pytest.mark.slow
 def test_the_user_s_bubble_is_followed_and_the_other_is_there_too():
     filmed = film("side by side, pointed at", 0)
     for bubble, other in ((0, 1), (1, 0)):
@@ -83,6 +86,7 @@ def test_the_user_s_bubble_is_followed_and_the_other_is_there_too():
         assert np.nanmax(np.abs(second - filmed.radius[other])) < 2
 
 
+@pytest.mark.slow
 def test_bubbles_that_are_alike_are_told():
     _, result = read(film("side by side, unmarked", 0))
     (note,) = result.notes
@@ -215,6 +219,7 @@ def test_choices_that_cannot_be(tmp_path, monkeypatch, words, message):
     assert message in outcome.output
 
 
+@pytest.mark.slow
 def test_a_point_far_from_any_bubble(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tifffile.imwrite("m.tif", np.array(film("clean", 0).frames), photometric="minisblack")

@@ -59,6 +59,7 @@ def test_of_bubbles_that_overlap_no_reading_is_wrong(ratio, overlap, angle, seed
     assert "two bubbles: " in doubted(result.readings)
 
 
+@pytest.mark.slow
 def test_a_frame_of_two_bubbles_that_is_confirmed_has_the_radius_of_its_own_arc():
     frames, centres = pair(0.93, 0.2, 0.3, 1)
     largest = 3 + int(np.argmax(RADII))

@@ -86,6 +86,7 @@ def test_a_bubble_at_rest_that_the_frame_cuts_is_no_needle(swing):
     assert np.abs(wrong).max() < 0.15
 
 
+@pytest.mark.slow
 def test_a_small_bubble_of_which_a_mask_leaves_most_is_read_as_sharp_as_the_movie_is():
     shade = needle(-90, 9, 18)
     watched = ndimage.gaussian_filter(shade, 2) < 0.01
@@ -94,6 +95,7 @@ def test_a_small_bubble_of_which_a_mask_leaves_most_is_read_as_sharp_as_the_movi
     assert np.nanmax(np.abs(wrong)) < 0.15
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_there_twice_is_no_second_reading_and_is_told():
     frames = filmed(0.0)
     twice = [k for k in range(len(frames)) for _ in range(2 if k in (4, 20, 21) else 1)]
@@ -117,6 +119,7 @@ def test_frames_of_a_movie_without_noise_may_be_the_same():
     assert np.nanmax(np.abs(wrong)) < 0.15
 
 
+@pytest.mark.slow
 def test_an_ellipse_at_rest_at_a_needle_is_told_from_it():
     radii = np.array([*np.linspace(34, 15, 6), *(11 + 0.5 * np.sin(np.arange(22)))])
     result = track(movie_of(filmed(needle(-90, 10, 6), radii, stretch=1.27)))
@@ -126,11 +129,12 @@ def test_an_ellipse_at_rest_at_a_needle_is_told_from_it():
     assert np.nanmax(np.abs(wrong) / [max(r.errors.std, 0.1) if r.used else 1 for r in result.readings]) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "radii",
     [
         [22.0, 21.1, 20.3, 19.4, 18.6, *[17.7] * 25],
-        pytest.param(17 + np.sin(np.arange(30) / 2), marks=pytest.mark.slow),
+        17 + np.sin(np.arange(30) / 2),
     ],
 )
 def test_half_a_disc_at_a_wall_is_told_from_a_needle_that_reaches_into_it(radii):

@@ -84,6 +84,7 @@ def test_a_bright_rim_moves_no_radius(rim, blur):
     assert abs(np.median(off)) < np.median(common)
 
 
+@pytest.mark.slow
 def test_a_rim_with_which_no_outline_can_be_fitted_again_is_left_out(monkeypatch):
     again, calls = background._again, []
 
@@ -103,15 +104,17 @@ def test_a_rim_beside_noise_moves_radii_less_than_what_they_are_said_to_share(ra
     assert np.std((off - np.median(off)) / std) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height", "length"),
-    [*(pytest.param(*rim, marks=pytest.mark.slow) for rim in ((0.2, 3.0), (0.4, 1.5))), (0.4, 3.0)],
+    [(0.2, 3.0), (0.4, 1.5), (0.4, 3.0)],
 )
 def test_a_rim_of_another_shape_is_within_what_radii_are_said_to_share(height, length):
     off, _, common = errors(filmed(one_sided(height, length)))
     assert np.all(np.abs(off) < 1.2 * common)
 
 
+@pytest.mark.slow
 def test_a_rim_that_blur_hides_is_within_what_radii_are_said_to_share():
     off, std, common = errors(filmed(gaussian(0.25, 3.0, 1.5), blur=3.0))
     assert np.sqrt(np.mean(off**2 / (std**2 + common**2))) < 1

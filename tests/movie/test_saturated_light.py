@@ -36,11 +36,12 @@ def off(readings, radii=RADII):
     return np.array([r.radius for r in readings]) - radii - 0.4 / radii
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shown",
     [
         [255 * (image > 75).astype(np.uint8) for image in filmed()],
-        pytest.param([255 * (image > 130).astype(np.uint8) for image in filmed()], marks=pytest.mark.slow),
+        [255 * (image > 130).astype(np.uint8) for image in filmed()],
         of_8_bit(filmed(light=400.0)),
         of_8_bit([3 * (160 - image) for image in filmed()]),
     ],

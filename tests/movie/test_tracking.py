@@ -149,7 +149,8 @@ def test_what_a_lasting_shape_hides_is_one_factor_of_all_radii():
     assert 0.5 < np.sqrt(np.mean(np.square(scatter))) < 1.5
 
 
-@pytest.mark.parametrize("first", [80, pytest.param(83, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [80, 83])
 def test_an_elongated_bubble_that_the_frame_cuts_has_an_error_to_match(first):
     """A circle about the parts of its outline that are seen is another one than about the whole."""
     true, off = np.array([12.0, 18.0, 22.0, 30.0, 34.0, 31.0, 24.0, 19.0, 15.0]), []
@@ -200,6 +201,7 @@ def test_specks_of_dirt_do_not_tell_how_sharp_an_edge_is():
     assert find_background(movie_of(shown))[1].width == pytest.approx(1.2, abs=0.15)
 
 
+@pytest.mark.slow
 def test_nested_circles_of_a_faint_frame_are_found():
     """A first step would shrink the innermost one to nothing."""
     scores, _ = rendered("three flashes, 3 to 8 px apart", 5003)
@@ -245,6 +247,7 @@ def test_a_bubble_that_covers_half_of_the_frame_is_no_change_of_light(noise):
     assert np.abs(off / [r.errors.std for r in found.readings[3:]]).max() < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lamp", ["fades", "flickers"])
 def test_a_lamp_that_changes_much_leaves_the_radii(lamp):
     radii = np.linspace(31.0, 8.0, 24)

@@ -194,6 +194,7 @@ def test_a_constant_truth_is_seldom_told_to_change():
     assert min(changed) > np.log(20)
 
 
+@pytest.mark.slow
 def test_same_bits_with_any_executor():
     whole = assimilate(problem(), SETTINGS, 1)
     for kind in (ThreadsExecutor, ProcessesExecutor):
@@ -201,5 +202,6 @@ def test_same_bits_with_any_executor():
             assert_same_bits(assimilate(problem(), SETTINGS, 1, executor), whole)
 
 
+@pytest.mark.slow
 def test_resumed_from_any_iteration():
     assert_cut_anywhere(problem(), SETTINGS, 1, cuts=6)

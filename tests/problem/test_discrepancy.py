@@ -376,6 +376,7 @@ def known_posterior():
     return problem, z, weights, mean, float(np.sqrt(np.sum(weights * (variances + (means - mean) ** 2)))), evidence
 
 
+@pytest.mark.slow
 def test_linear_problem_against_quadrature():
     problem, _, _, mean, std, evidence = known_posterior()
     plain = assimilate(problem, AssimilationSettings(), 1)

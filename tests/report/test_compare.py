@@ -93,6 +93,7 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     assert comparison_table(compare_runs(runs)) in done.output
 
 
+@pytest.mark.slow
 def test_evidences_of_different_data_are_not_compared(tmp_path):
     one = run_dir(tmp_path / "one", ("a",))
     for other, message in (

@@ -70,7 +70,8 @@ ESTIMATED = {
 }
 
 
-@pytest.mark.parametrize("kind", ["sigma", pytest.param("discrepancy", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["sigma", "discrepancy"])
 def test_errors_of_a_size_that_parameters_tell_are_right(toy, tmp_path, kind):
     """Each member has a size of its own, by which J_o of readings drawn at it differs."""
     estimated = {**QUIET, **ESTIMATED[kind]}

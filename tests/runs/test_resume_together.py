@@ -45,7 +45,7 @@ def call(words: list[str], *more: object, stop_at: int = 0) -> tuple[Result, int
 
 
 @pytest.mark.fault("kill-commands")
-@pytest.mark.parametrize("again", ["as told", "given again"])
+@pytest.mark.parametrize("again", ["as told", pytest.param("given again", marks=pytest.mark.slow)])
 def test_stopped_anywhere_it_continues_to_the_same_bits(command: list[str], tmp_path: Path, again: str) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     done, calls = call(command, "--out", whole)
@@ -67,6 +67,7 @@ def test_stopped_anywhere_it_continues_to_the_same_bits(command: list[str], tmp_
     assert sorted(p.name for p in cut.rglob("*")) == sorted(p.name for p in whole.rglob("*"))
 
 
+@pytest.mark.slow
 def test_what_is_whole_is_kept_if_asked_for_and_never_by_force(command: list[str], tmp_path: Path) -> None:
     done, calls = call(command, "--out", tmp_path)
     assert done.exit_code == 0, done.output
@@ -82,6 +83,7 @@ def test_what_is_whole_is_kept_if_asked_for_and_never_by_force(command: list[str
     assert "force replaces a run, resume continues it; give one of them" in both.stderr
 
 
+@pytest.mark.slow
 def test_another_question_is_not_answered_by_what_was_kept(command: list[str], tmp_path: Path) -> None:
     other = [*command, command[-2], "A"]
     _, alone = call(other, "--out", tmp_path / "alone")

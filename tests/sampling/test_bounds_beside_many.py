@@ -17,7 +17,7 @@ TIMES, STD = np.linspace(0.2, 4, COUNT), 0.5 * math.sqrt(COUNT / 12)
 SCORES = np.linspace(-7, 7, 2001)
 
 
-@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("correlated", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_beside_many_readings_a_posterior_at_a_bound_is_told_as_beside_few(correlated):
     """Half-normal k of a line a + k t, a ~ N(0, 1): the Gaussian about the mode is 0.6 standard deviations off, and two
     fifths too wide.

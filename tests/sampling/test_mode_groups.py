@@ -60,6 +60,7 @@ def test_a_walker_that_creeps_in_a_tail_is_no_mode():
     assert not belonging(PRIOR, minima, x, equal, 100.0).any()
 
 
+@pytest.mark.slow
 def test_modes_that_no_descent_ended_in_are_told(monkeypatch):
     """sin 3x is known to 3 %: needles all over the prior, of which one is known."""
     monkeypatch.setattr("en4dvar.estimation.assimilate.that_count", lambda minima, prior: minima[:1])
@@ -77,7 +78,8 @@ def test_modes_that_no_descent_ended_in_are_told(monkeypatch):
     assert np.isfinite(modes["mode_cost"].values).all()
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 7])
 def test_of_a_cheap_function_an_alias_is_found(seed):
     """The frequency of a sine read once a second: 30 % of the posterior, by a sum over a grid, is below 3."""
     random = np.random.default_rng(7)

@@ -126,7 +126,8 @@ def test_a_tail_along_which_the_cost_hardly_rises_is_told(seed):
     assert "k" in told.parameters
 
 
-@pytest.mark.parametrize("seed", [78, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (99, 120))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [78, 99, 120])
 def test_the_upper_end_of_a_growth_that_is_seen_to_its_bend_is_told_or_sampled(seed):
     """Of a logistic growth, against draws of the prior: how far it goes has a long tail, along a bent way."""
     rng, t = np.random.default_rng(seed), np.linspace(0.5, 10, 12)
@@ -181,7 +182,8 @@ def test_few_members_do_not_tell_what_it_should_be(name):
     assert told.severity == "serious"  # most of the posterior is where the ensemble is not
 
 
-@pytest.mark.parametrize("seed", [102, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 17, 147))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [102, 0, 17, 147])
 def test_the_edge_of_a_step_is_never_quoted_for_its_plateau(seed):
     """Of a whole number n, against the closed form: the lowest minimum is the narrow edge of a step, and another
     descent ends on a plateau, which holds almost all of the posterior.
@@ -225,7 +227,8 @@ class Driven(ForwardModel):
         return np.array([left * state[0] + state[1] * (1 - left) / 0.3, state[1]])
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 4))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3, 4])
 def test_an_estimated_width_of_changes_is_never_gaussian(seed):
     """Against the closed form, integrated over the width; weights of 2, 20 and 28 members told 0.08 to 0.14 as its
     standard deviation, or nothing at all.
@@ -259,7 +262,10 @@ def test_an_estimated_width_of_changes_is_never_gaussian(seed):
     assert "declare the model cheap" in told.advice
 
 
-@pytest.mark.parametrize(("n", "members"), [(1, 16), (12, 16), (1, 200), pytest.param(12, 48, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("n", "members"),
+    [(1, 16), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(12, 16), (1, 200), (12, 48)])],
+)
 def test_a_linear_function_is_neither_sampled_nor_doubted(n, members):
     """Weights of the posterior and of the ensemble are the same, so that nothing hangs on what was drawn."""
     names, slopes = [f"k{i}" for i in range(n)], np.random.default_rng(5).standard_normal((40, n)) / np.sqrt(n)

@@ -259,6 +259,7 @@ BESIDE_A_FIELD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", BESIDE_A_FIELD)
 def test_a_parameter_beside_a_localised_field(scheme):
     """F of Lorenz-96, drawn from N(8, 1), is estimated; errors of F and of the state are as large as their spread."""
