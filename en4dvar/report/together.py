@@ -233,7 +233,10 @@ def sentences(stored: StoredPopulation, called: Mapping[str, str] = NAMES) -> tu
             of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
             lines.append(_in_parts(stored, centre, of_it, centre.std, called))
         lines += _compared(stored, centre, called)
-    odd = named(np.array([*stored.belongs.values()]), float(stored.tree.attrs.get("hyperprior_odd", 0)))
+    if stored.doubted:
+        words = "Counted only as far as the others bear them out, since warnings say that their readings are wrong"
+        lines.append(f"{words}: {', '.join(stored.doubted)}.")
+    odd = named(np.array([*stored.belongs.values()]), stored.odd_before)
     if odd:
         names = ", ".join(stored.datasets[i] for i in odd)
         lines.append(f"Perhaps not of the population; these numbers count them only as far as they are: {names}.")

@@ -270,6 +270,8 @@ def save_population(
     if len(population.belongs):
         words = "probability that the data set is of the population"
         beside["belongs"] = variable("dataset", population.belongs, "1", words)
+        words = "probability that it is not, before its data are seen"
+        beside["odd_before"] = variable("dataset", population.odd_before, "1", words)
     digests = text(digest(o.times.tobytes() + o.values.tobytes()) for o in observed)  # of the same readings the same
     beside["readings"] = variable("dataset", digests, "", "SHA-256 of times and values of the readings")
     groups = {
@@ -384,6 +386,19 @@ class StoredPopulation(StoredGroups):
         """Data set → probability that it is of the population; empty in files of version 1.0."""
         alone = self.group("alone")
         return dict(zip(self.datasets, map(float, alone["belongs"].values), strict=True)) if "belongs" in alone else {}
+
+    @property
+    def odd_before(self) -> Array:
+        """(S,) probabilities that data sets are not of the population, before their data are seen."""
+        usual = np.full(len(self.datasets), float(self.tree.attrs.get("hyperprior_odd", 0)))
+        alone = self.group("alone")
+        return np.asarray(alone["odd_before"].values, dtype=float) if "odd_before" in alone else usual
+
+    @property
+    def doubted(self) -> tuple[str, ...]:
+        """The data sets that are odd more probably than others, before their data are seen."""
+        odd = self.odd_before
+        return tuple(name for name, own in zip(self.datasets, odd, strict=True) if own > odd.min())
 
     @property
     def readings(self) -> dict[str, str]:

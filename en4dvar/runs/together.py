@@ -47,6 +47,8 @@ DIFFER = (
     "look at what the first and the last of these do not share, as scale, frame rate, gel, batch: mend what is wrong, "
     "and estimate different gels each by itself; if there is nothing, the parameter itself varies so"
 )
+MISREAD = "implausible-data", "lost-frame"  # that readings of a data set are wrong
+MOST = 0.5  # of the data sets: what more share is no oddity of each
 SPOILT = 1 / 3  # of the data sets: where more are warned of alike, the warning is serious for all together
 
 
@@ -301,13 +303,20 @@ class PopulationKind(TogetherKind):
         with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
             population = population_of(
                 problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=hyper,
-                effort=self.effort, executor=executor, tell=tell,
+                effort=self.effort, executor=executor, tell=tell, doubted=_doubted(sets),
             )  # fmt: skip
         tell(f"{counted(population.forward_runs, 'forward run')}, {counted(population.size, 'effective draw')}")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
         about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}
         stored.save_population(path, population, [s.members for s in used], cautions, about)
+
+
+def _doubted(sets: Sequence[Finished]) -> set[str]:
+    """Names of the data sets whose own warnings say that readings are wrong."""
+    serious = [(c.code, s.name) for s in sets for c in s.cautions if c.severity == "serious"]
+    each = [{name for of_it, name in serious if of_it == code} for code in MISREAD]
+    return set[str]().union(*(names for names in each if len(names) <= MOST * len(sets)))
 
 
 def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:

@@ -38,6 +38,8 @@ def test_the_bubble_is_named_by_itself_and_beside_the_value_of_the_gel(tmp_path,
     assert told.startswith(f"warning: the population and b{TWICE}: after the reading at ")
     assert "too late, as if a frame was counted twice" in told
     assert "leave this recording out" in told
+    words = "Counted only as far as the others bear them out, since warnings say that their readings are wrong"
+    assert f"{words}: b{TWICE}." in done.output
     rows = list(csv.DictReader((tmp_path / "runs/gel/summary.csv").read_text().splitlines()))
     spoilt = {row["dataset"] for row in rows if row["name"] == "G" and "lost-frame" in row["untrusted"]}
     assert spoilt == {f"b{TWICE}"}

@@ -79,18 +79,19 @@ def likely(problems, std=STD):
     return np.array(found).T
 
 
-def exact(problems, hyper, common=OF_D.std):
+def exact(problems, hyper, common=OF_D.std, doubted=()):
     """Mean and std of ν, and mean of τ, on a grid of m = ν + d/2 and τ: given m the data say nothing of ν."""
+    odds = [max(0.9, hyper.odd) if p.observations.name in doubted else hyper.odd for p in problems]
     m, tau = np.linspace(-3, 4, 281), np.geomspace(1e-3, 3, 121)
     of_nu, of_d = (0.9 * hyper.mean_std) ** 2, (SLOPE * common) ** 2
     log = norm(0.6, np.sqrt(of_nu + of_d)).logpdf(m)[:, None] - 0.5 * (tau / (0.9 * hyper.spread)) ** 2
     wide = np.sqrt(0.9**2 + of_d)
-    for best, variance in likely(problems).T:
+    for best, variance, share in zip(*likely(problems), odds, strict=True):
         inside = norm(best, np.sqrt(variance + tau**2)).logpdf(m[:, None])
         outside = norm(0.6, np.sqrt(variance + wide**2)).pdf(best)
         elsewhere = norm(best, np.sqrt(variance + tau**2 + (0.9 * hyper.mean_std) ** 2)).pdf(m[:, None])
-        odd = np.log(hyper.odd / 2) + np.log(outside + elsewhere) if hyper.odd else -np.inf
-        log = log + np.logaddexp(np.log1p(-hyper.odd) + inside, odd)
+        odd = np.log(share / 2) + np.log(outside + elsewhere) if share else -np.inf
+        log = log + np.logaddexp(np.log1p(-share) + inside, odd)
     weights = np.exp(log - log.max()) * np.gradient(tau)
     weights /= weights.sum()
     share, left = of_nu / (of_nu + of_d), of_nu * of_d / (of_nu + of_d)
@@ -160,6 +161,24 @@ def test_an_odd_data_set_is_named_and_moves_nothing():
     assert found.posterior.between.mean() == pytest.approx(between, rel=0.15)
     strict = population_of(problems, members(problems), ["a"], 2, kept=kept, hyper=HYPER, effort=ROUGH)
     assert np.median(strict.posterior.tau) > 2 * np.median(found.posterior.tau)
+
+
+def test_one_whose_readings_are_doubted_counts_where_the_others_bear_it_out():
+    """Too near to be odd by its data, it would widen the spread, and move the mean to its side."""
+    values = truths(0.1)
+    values[3] += 0.35
+    problems, hyper = campaign(values), replace(HYPER, odd=0.05)
+    found = population_of(
+        problems, members(problems), ["a"], 2, kept=known(problems, -1), hyper=hyper, doubted={"set3"}
+    )
+    mean, std, between = exact(problems, hyper, doubted={"set3"})
+    assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert found.posterior.mean.std() == pytest.approx(std, rel=0.1)
+    assert found.posterior.between.mean() == pytest.approx(between, rel=0.15)
+    assert exact(problems, hyper)[2] > 1.3 * between
+    assert found.odd == ()
+    assert hyper.odd_before([False, True]).tolist() == [0.05, 0.9]
+    assert replace(hyper, odd=0.0).odd_before([True]).tolist() == [0.0]
 
 
 def test_one_that_is_odd_in_one_parameter_alone_is_named():

@@ -28,8 +28,9 @@ from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem
 from en4dvar.report.together import forest, sentences
 from en4dvar.results.together import load_population
+from en4dvar.runs.finished import finished
 from en4dvar.runs.runner import run_campaign
-from en4dvar.runs.together import _cautions, population
+from en4dvar.runs.together import _cautions, _doubted, population
 
 STD, SETS = 0.3, 6
 SMALL = Effort(hyper_walkers=32, draws=1500)
@@ -133,6 +134,22 @@ def test_who_is_odd_is_said_beside_the_number(found):
     tree["alone"]["belongs"][2] = 0.3
     line = "Perhaps not of the population; these numbers count them only as far as they are: set2."
     assert line in sentences(replace(stored, tree=tree))
+
+
+def test_a_data_set_whose_readings_are_warned_of_counts_only_with_the_others(campaign, tmp_path, monkeypatch):
+    config, sets = finished([campaign], True, None)
+    sets = [replace(s, drawn=OwnDraws(s.white, 0.0, float(len(s.white)), 0)) for s in sets]
+    wrong = caution("lost-frame", "after the reading at 3 s all times seem one interval too early")
+    warned = [*sets[:2], replace(sets[2], cautions=(wrong,))]
+    monkeypatch.setattr("en4dvar.runs.together.finished", lambda *of: (config, warned))
+    stored, page = population([campaign], ["k"], tmp_path, effort=SMALL)
+    assert stored.odd_before.tolist() == [0.05, 0.05, 0.9]
+    assert stored.belongs["set2"] < 0.6 < min(stored.belongs["set0"], stored.belongs["set1"])
+    line = "Counted only as far as the others bear them out, since warnings say that their readings are wrong: set2."
+    assert line in sentences(stored)
+    assert "and of 0.9 if warnings of its own say that readings are wrong (set2)" in page.read_text()
+    assert _doubted([replace(s, cautions=(replace(wrong, severity="caution"),)) for s in sets]) == set()
+    assert _doubted([replace(s, cautions=(wrong,)) for s in sets]) == set()  # what most share is no oddity
 
 
 def test_the_next_spring_is_less_certain_than_the_mean(found):

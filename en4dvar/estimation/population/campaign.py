@@ -8,7 +8,7 @@ population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -70,8 +70,9 @@ class Population:
     ``effective``: numbers of independent draws that stand behind the hierarchy and, together, behind the data sets;
     ``log_evidence``: of all data, hyperpriors included, without Σ ln(std √2π); ``forward_runs`` that were made.
     ``common``: names of the quantities with one value in all data sets, ``theta`` (M, c) their draws in units of the
-    prior. ``belongs`` (S,): probability that each data set is of the population. ``empirical``: for each of ``names``
-    the median of the data sets one by one. ``left_out``: data sets that could not be sampled, and why.
+    prior. ``belongs`` (S,): probability that each data set is of the population, ``odd_before``: that it is not, before
+    its data are seen. ``empirical``: for each of ``names`` the median of the data sets one by one. ``left_out``: data
+    sets that could not be sampled, and why.
     ``uncertain``: variance that the scarcity of the data sets' draws leaves of ln p(all data | mean and spread).
     """
 
@@ -87,6 +88,7 @@ class Population:
     common: tuple[str, ...] = ()
     theta: Array = field(default_factory=lambda: np.empty((0, 0)))
     belongs: Array = field(default_factory=lambda: np.empty(0))
+    odd_before: Array = field(default_factory=lambda: np.empty(0))
     empirical: tuple[Empirical, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
     uncertain: float = 0.0
@@ -109,7 +111,7 @@ class Population:
     @property
     def odd(self) -> tuple[int, ...]:
         """Numbers of the data sets that are named as odd."""
-        return named(self.belongs, self.hyper.odd)
+        return named(self.belongs, self.odd_before)
 
     @property
     def learned(self) -> tuple[Array, Array]:
@@ -209,6 +211,7 @@ def population_of(
     hyper: HyperPrior | None = None,
     effort: Effort | None = None,
     tell: Callable[[str], None] = lambda words: None,
+    doubted: Collection[str] = (),
 ) -> Population:
     """The population of ``names`` behind data sets of the same parameters.
 
@@ -219,6 +222,7 @@ def population_of(
     hyper: in units of the prior's standard deviations. One that is much wider than the prior reaches where draws of
         the posterior do not: data sets are then sampled anew, with a prior as wide.
     tell: called with a line about each data set.
+    doubted: names of data sets that are odd with probability :data:`~en4dvar.estimation.population.hierarchy.DOUBTED`.
 
     Raises
     ------
@@ -237,7 +241,9 @@ def population_of(
         wide = [_about(problem, names, *around) for problem in problems]
         at = [w.prior.white(p.prior.from_white(z)) for w, p, z in zip(wide, problems, start, strict=True)]
         scaled = replace(hyper, mean_std=hyper.mean_std / factor, spread=hyper.spread / factor)
-        result = population_of(wide, at, names, seed, executor=executor, hyper=scaled, effort=effort, tell=tell)
+        result = population_of(
+            wide, at, names, seed, executor=executor, hyper=scaled, effort=effort, tell=tell, doubted=doubted
+        )
         sampled = tuple(p for p in problems if p.observations.name not in result.left_out)
         posterior, prior = (
             replace(draws, nu=factor * draws.nu, tau=factor * draws.tau) for draws in (result.posterior, result.prior)
@@ -245,7 +251,7 @@ def population_of(
         return replace(result, problems=sampled, hyper=hyper, posterior=posterior, prior=prior)
     with one_blas_thread():
         drawn, left_out = sampled_sets(problems, start, seed, executor, tell, kept)
-        result = population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+        result = population_from(drawn, left_out, start, problems, names, seed, hyper, effort, doubted)
         for number in range(ANEW):
             if result.uncertain < SCARCE:
                 break
@@ -255,7 +261,7 @@ def population_of(
                 if belongs > BELONGS:
                     again, enough = own_seed(seed, f"sampled anew, {number}"), ENOUGH * 2**number
                     drawn[s] = _drawn_about(problems[s], names, near, start[s], drawn[s], again, executor, enough)
-            anew = population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+            anew = population_from(drawn, left_out, start, problems, names, seed, hyper, effort, doubted)
             result = replace(anew, empirical=result.empirical)  # of the data sets' own posteriors
         return result
 
@@ -314,6 +320,7 @@ def sampled_sets(
 def population_from(
     drawn: Mapping[int, OwnDraws], left_out: Mapping[str, str], start: Sequence[Array],
     campaign: Sequence[InverseProblem], names: Sequence[str], seed: int, scales: HyperPrior, effort: Effort,
+    doubted: Collection[str] = (),
 ) -> Population:  # fmt: skip
     """The population of the data sets that could be sampled."""
     problems = tuple(campaign[s] for s in drawn)
@@ -324,7 +331,8 @@ def population_from(
     logs = np.array([term.log_std for term in terms])
     draws, mean, root = in_units_of_the_common(list(drawn.values()), varying, shared, logs)
     likelihoods = own_likelihoods(draws, varying, shared, seed, sets, logs)
-    estimated = Hierarchy(likelihoods, scales).sampled(seed, effort)
+    before = scales.odd_before([name in doubted for name in sets])
+    estimated = Hierarchy(likelihoods, scales, before).sampled(seed, effort)
     theta, stream = mean + estimated.theta @ root.T, member_stream(seed, "hyperprior")
     nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
     z = _sets(estimated, draws, likelihoods, varying, shared, member_stream(seed, "sets given all"))
@@ -345,6 +353,7 @@ def population_from(
         common=common,
         theta=theta,
         belongs=estimated.belongs,
+        odd_before=before,
         empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
         uncertain=float(estimated.uncertain.sum()),
         left_out=left_out,

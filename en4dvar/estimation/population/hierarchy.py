@@ -8,8 +8,10 @@ then its parameters are drawn from the prior as if it belonged to no population,
 as much as medians of populations differ a priori (σ is that of ν's prior), as where the gel is stiffer or the law is
 another one. So one bubble of another gel moves the mean little and widens the spread hardly; how probably each belongs
 is part of the answer. Were an odd one always odd in all parameters, one that is so in G alone would have to be
-improbable in the others, and would widen the spread instead. θ are quantities with one value in all data sets, whose
-uncertainty therefore no number of data sets averages out.
+improbable in the others, and would widen the spread instead. ε is :data:`DOUBTED` for a data set whose own warnings
+say that its readings are wrong: with the usual ε it would count in full unless it errs by several error bars, and lost
+frames, say, all err to one side. Where the warning was false this costs hardly more than leaving the data set out.
+θ are quantities with one value in all data sets, whose uncertainty therefore no number of data sets averages out.
 
 With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
 
@@ -40,6 +42,7 @@ from en4dvar.sampling.walkers import walked
 
 SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
 FIT = 3000  # positions that the proposal is fitted to
+DOUBTED = 0.9  # probability that a data set is odd whose own warnings say that its readings are wrong
 RAISED, A_SET = 5.0, 0.25  # times more probably odd by its data, and times the number of sets: named
 
 
@@ -58,6 +61,10 @@ class HyperPrior:
     odd: Annotated[
         float, Ge(0), Lt(1), "Probability that a data set is odd: of another population, in all parameters or in one."
     ] = 0.05
+
+    def odd_before(self, doubted: Sequence[bool]) -> Array:
+        """(S,) probabilities to be odd of data sets, some of which are ``doubted`` for what they say by themselves."""
+        return np.where(doubted, max(DOUBTED, self.odd), self.odd) if self.odd else np.zeros(len(doubted))
 
     def log_density(self, nu: Array, log_tau: Array) -> Array:
         """(B,) of ν and ln τ (B, p), normalised; −inf where a spread is out of bounds."""
@@ -88,16 +95,16 @@ class Effort:
     effective: float = 300.0
 
 
-def named(belongs: Array, odd: float) -> tuple[int, ...]:
-    """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds, odd/(1 − odd),
-    the data raise by more than S/4, and at least fivefold.
+def named(belongs: Array, odd: Array | float) -> tuple[int, ...]:
+    """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds, odd/(1 − odd)
+    before, the data raise by more than S/4, and at least fivefold.
 
     The ratio of the odds is the best test of one data set against the others (Neyman & Pearson 1933); the bound grows
     with S as so many may be named by chance, and was set so that fewer than 5 % of campaigns of 12 without an odd one
     name one (``benchmarks/campaigns.py power``). Were a probability of one half asked, half of the bubbles of four
     times the modulus would be missed, as a wider spread explains them as well.
     """
-    if not odd:
+    if not np.all(odd):
         return ()
     with np.errstate(divide="ignore"):
         raised = (1 - belongs) / belongs * (1 - odd) / odd
@@ -122,14 +129,18 @@ class HierarchyDraws:
 
 
 class Hierarchy:
-    """The posterior density of h = (ν, ln τ, θ)."""
+    """The posterior density of h = (ν, ln τ, θ). ``odd`` (S,): how probably each data set is odd, if not as ``scales``
+    say.
+    """
 
-    def __init__(self, likelihoods: Sequence[OwnLikelihood], scales: HyperPrior):
-        self.likelihoods, odd = likelihoods, scales.odd
+    def __init__(self, likelihoods: Sequence[OwnLikelihood], scales: HyperPrior, odd: Array | None = None):
+        self.likelihoods = likelihoods
+        self.odd = scales.odd_before([False] * len(likelihoods)) if odd is None else odd
         self.following = likelihoods[0].following
         self.p, self.c = self.following.slopes.shape
         self.hyper = scales
-        self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
+        shares = np.stack([1 - self.odd, self.odd / 2, *[self.odd / 2 / self.p] * self.p], axis=1)
+        self.shares = shares[:, : None if scales.odd else 1]  # (S, K)
         self.wider = scales.mean_std**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
 
     def log_parts(self, h: Array) -> Array:
@@ -138,8 +149,8 @@ class Hierarchy:
         """
         mean, variance = h[:, : self.p], np.exp(2 * h[:, self.p : 2 * self.p])
         theta = h[:, 2 * self.p :]
-        parts = np.zeros((len(h), len(self.likelihoods), len(self.shares)))
-        for k in range(len(self.shares)):
+        parts = np.zeros((len(h), *self.shares.shape))
+        for k in range(self.shares.shape[1]):
             if k != 1:
                 of_y = self.following.moments(mean, variance + self.wider[k], theta)
                 for s, likelihood in enumerate(self.likelihoods):
@@ -185,7 +196,7 @@ class Hierarchy:
         What half of the draws says differs from what all say by an error like that of all (half-sample replication:
         McCarthy 1969, Rev. Int. Stat. Inst. 37, 239).
         """
-        halves = Hierarchy([replace(own, mixture=own.half) for own in self.likelihoods], self.hyper)
+        halves = Hierarchy([replace(own, mixture=own.half) for own in self.likelihoods], self.hyper, self.odd)
         half, whole = (np.logaddexp.reduce(of.log_parts(h), axis=2) for of in (halves, self))
         return np.asarray((half - whole).var(axis=0))
 
