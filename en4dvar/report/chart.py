@@ -184,12 +184,12 @@ class Chart:
         return sum(row.height for row in self.rows)
 
 
-def in_columns(panels: Iterable[Panel], height: float, columns: int = 2, width: float = COLUMN) -> Chart:
-    """Panels in rows of up to ``columns``; empty places are bare."""
+def in_columns(panels: Iterable[Panel], height: float, columns: int = 2, width: float = 0.0) -> Chart:
+    """Panels in rows of up to ``columns``; empty places are bare. ``width``: of all, else a journal column each."""
     held = list(panels)
     columns = min(columns, len(held))
     held += [Panel(bare=True) for _ in range(-len(held) % columns)]
-    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)], width)
+    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)], width or COLUMN * columns)
 
 
 def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = COLUMN) -> Chart:
