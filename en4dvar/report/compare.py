@@ -212,7 +212,7 @@ def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
 def preferred(best: str, second: str, by: float) -> str:
     """That one of two runs has the log-evidence that is larger ``by`` so much, or that the data do not decide."""
     if by < UNDECIDABLE:
-        return f"undecidable: {best} and {second} differ by {by:.2f} in log-evidence"
+        return f"undecidable: {best} and {second} differ by {by:z.2f} in log-evidence"
     return f"{best} is preferred: log-evidence {by:.2f} above {second}"
 
 
