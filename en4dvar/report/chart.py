@@ -184,15 +184,15 @@ class Chart:
         return sum(row.height for row in self.rows)
 
 
-def in_columns(panels: Iterable[Panel], height: float, columns: int = 2, width: float = COLUMN) -> Chart:
-    """Panels in rows of up to ``columns``; empty places are bare."""
+def in_columns(panels: Iterable[Panel], height: float, columns: int = 2, width: float = 0.0) -> Chart:
+    """Panels in rows of up to ``columns``; empty places are bare. ``width``: of all, else a journal column each."""
     held = list(panels)
     columns = min(columns, len(held))
     held += [Panel(bare=True) for _ in range(-len(held) % columns)]
-    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)], width)
+    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)], width or COLUMN * columns)
 
 
-def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = COLUMN) -> Chart:
+def stacked(panels: Sequence[Panel], height: float, xlabel: str) -> Chart:
     """Panels below each other with one axis along x, and a legend of all their marks above."""
     *others, last = panels
     for panel in others:
@@ -205,7 +205,7 @@ def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = 
     heights = np.full(len(panels), height)
     heights[0] += 0.5 * POINTS * first.legend
     heights[-1] += 0.8 * POINTS
-    return Chart([Row(float(h), [panel]) for h, panel in zip(heights, panels, strict=True)], width)
+    return Chart([Row(float(h), [panel]) for h, panel in zip(heights, panels, strict=True)])
 
 
 def interval(mean: Array, std: Array, reach: float, positive: bool) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from en4dvar.plumbing.files import make_folder
 from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
+from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
@@ -212,7 +212,7 @@ def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
 def preferred(best: str, second: str, by: float) -> str:
     """That one of two runs has the log-evidence that is larger ``by`` so much, or that the data do not decide."""
     if by < UNDECIDABLE:
-        return f"undecidable: {best} and {second} differ by {by:.2f} in log-evidence"
+        return f"undecidable: {best} and {second} differ by {by:z.2f} in log-evidence"
     return f"{best} is preferred: log-evidence {by:.2f} above {second}"
 
 
@@ -266,8 +266,7 @@ def overlay(comparison: Comparison) -> Chart:
     names = comparison.parameters
     panels = [_panel([e for e in comparison.estimates if e.summary.name == name], comparison.runs) for name in names]
     panels[0].legend = True
-    height = (4.0 + 0.15 * len(comparison.runs)) * POINTS
-    return in_columns(panels, height, width=COLUMN * (2 if len(names) > 1 else 1))
+    return in_columns(panels, (4.0 + 0.15 * len(comparison.runs)) * POINTS)
 
 
 def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:

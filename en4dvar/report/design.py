@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from textwrap import fill
@@ -241,13 +242,14 @@ def write_design(folder: Path) -> Path:
         figures.append(("prices", FRONT, prices(designs)))
     if all(len(row.evaluated.grid) for row in rows):
         figures.append(("fans", FANS, fans(designs)))
-    told = ["; ".join([words(designs, row), *needs(designs, row)]) for row in best]
+    written = replace(designs, asked=designs.asked.written)
+    told = ["; ".join([words(written, row), *needs(written, row)]) for row in best]
     return write_page(
         folder,
         "design",
-        designs=designs,
+        designs=written,
         by=by,
-        rows=[(settings_text(row), row, words(designs, row), row in best) for row in rows],
+        rows=[(settings_text(row), row, words(written, row), row in best) for row in rows],
         lab=[(settings_text(row), readings_text(designs, row), row, of) for row, of in zip(best, told, strict=True)],
         remarks=remarks(designs),
         drawings=draw(figures),

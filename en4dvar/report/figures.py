@@ -51,7 +51,7 @@ def histograms(result: StoredResult) -> Chart:
             panel.line([row.q05, row.q95], [1.07, 1.07], "posterior", 2.0)
         panel.upright(row.centre, "centre", dash="--")
         panels.append(panel)
-    return in_columns(panels, 3.6 * POINTS)
+    return in_columns(panels, 3.6 * POINTS, width=COLUMN)
 
 
 def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array] | None:
@@ -125,7 +125,7 @@ def traces(result: StoredResult) -> Chart:
             panel.line(steps, members[:, alive].mean(axis=1), "posterior")
         panel.line(steps, centre, "centre", 0.9, "--")
         panels.append(panel)
-    return in_columns(panels, 3.4 * POINTS)
+    return in_columns(panels, 3.4 * POINTS, width=COLUMN)
 
 
 def pairs(result: StoredResult) -> Chart:

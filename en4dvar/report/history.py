@@ -12,7 +12,7 @@ import numpy as np
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
-from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
+from en4dvar.report.chart import POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.text import axis_label, figure_text, shown, since, time_axis, with_unit
 from en4dvar.results.declared import Axis, zero_of
 from en4dvar.results.netcdf import Group, Variable
@@ -147,7 +147,7 @@ def prior_predictive(previews: Sequence[Preview]) -> Chart:
             panel.title = figure_text(f"{name}: {part.name}" if len(preview.problem.parts) > 1 else name)
         panels.append(panel)
     panels[0].legend = True
-    return in_columns(panels, 6.5 * POINTS, width=COLUMN * min(2, len(drawn)))
+    return in_columns(panels, 6.5 * POINTS)
 
 
 def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:

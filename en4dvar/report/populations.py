@@ -24,13 +24,13 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert, is_unit
 from en4dvar.priors.prior import PriorTerm
-from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
+from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
-from en4dvar.report.together import NAMES
+from en4dvar.results.declared import NAMES, Names
 from en4dvar.results.netcdf import understood
 from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
 
@@ -91,7 +91,7 @@ class PopulationsCompared:
     logarithmic: frozenset[str] = frozenset()
     calibrated: bool = False
     doubted: Mapping[str, Collection[str]] = field(default_factory=dict)
-    symbols: Mapping[str, str] = field(default_factory=dict)
+    symbols: Names = field(default_factory=Names)
 
     @property
     def caption(self) -> str:
@@ -176,7 +176,7 @@ def compare_populations(
     doubted = {name: [label for label, s in stored.items() if untrusted(s.cautions, name)] for name in names}
     return PopulationsCompared(
         tuple(stored), parameters, medians, quoted, tuple(differences), common, tuple(notes), lines, logarithmic,
-        calibrated, doubted, dict(chain.from_iterable(s.symbols.items() for s in stored.values())),
+        calibrated, doubted, Names(chain.from_iterable(s.symbols.items() for s in stored.values())),
     )  # fmt: skip
 
 
@@ -300,17 +300,14 @@ def _common(s: StoredPopulation, apart: Sequence[str], label: str) -> tuple[tupl
     return tuple((name, label if name in apart else prior) for name, prior in priors.items())
 
 
-def sentences(c: PopulationsCompared, called: Mapping[str, str] = NAMES) -> Iterator[str]:
-    """The answer: one sentence a pair and parameter, one a line, and what is taken to be common; ``called``: how a page
-    writes the names of parameters.
-    """
+def sentences(c: PopulationsCompared, names: Names = NAMES) -> Iterator[str]:
+    """The answer: one sentence a pair and parameter, one a line, and what is taken to be common."""
     for d in c.differences:
-        yield _sentence(replace(d, parameter=called.get(d.parameter, d.parameter)))
+        yield _sentence(d, names)
     for name, of_it in c.lines.items():
-        yield _line_sentence(c, name, of_it, called.get(name, name))
+        yield f"{names[name]} {_line_words(c, name, of_it)}"
     if c.common:
-        names = ", ".join(called.get(name, name) for name in c.common)
-        yield f"These have one value in all of them and cancel as far as they move all alike: {names}."
+        yield f"These have one value in all of them and cancel as far as they move all alike: {names.of(c.common)}."
     if not c.calibrated:
         yield (
             "For a single population quote its own median. Ratios and differences use all data, without the pull "
@@ -318,31 +315,31 @@ def sentences(c: PopulationsCompared, called: Mapping[str, str] = NAMES) -> Iter
         )
     for note in c.notes:
         name = re.split("[ :]", note, maxsplit=1)[0]  # most notes begin with the parameter that they are about
-        yield f"{called.get(name, name)}{note.removeprefix(name)}."
+        yield f"{names[name]}{note.removeprefix(name)}."
 
 
-def _sentence(d: Difference) -> str:
+def _sentence(d: Difference, names: Names = NAMES) -> str:
     low, middle, high = d.difference
     by, more = (d.difference, "more") if middle >= 0 else ((-high, -middle, -low), "less")
     difference = f"{_range(by, plain=True)}{unit_behind(d.unit)} {more}"
     sure, side = (d.greater, "larger") if d.greater >= 0.5 else (1 - d.greater, "smaller")
     chance = f"over {SURE}" if sure > SURE else f"{sure:.3f}" if sure > 0.99 else f"{sure:.2f}"
     if d.is_ratio:
-        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {difference}"
+        words = f"{names[d.parameter]} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {difference}"
     else:
-        words = f"{d.parameter} of {d.first} is {difference} than that of {d.second}"
+        words = f"{names[d.parameter]} of {d.first} is {difference} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
     alone = range_words(d.apart[0], d.apart[2], _std(d.apart), "1" if d.is_ratio else d.unit)
     words += f" (were nothing common: {alone}{' times' * d.is_ratio})"
     return f"{words}; not to be trusted: {d.untrusted.replace(' ', ', ')}." if d.untrusted else f"{words}."
 
 
-def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine, called: str) -> str:
+def _line_words(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
     unit = unit_behind(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
     rising = float(np.mean(of_it.slope > 0))
     by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)}{unit}"
-    words = f"{called} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
+    words = f"grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
         return f"{words}; they do not lie on a line (χ² {chi} of {of_it.freedom}), for which the interval is widened."
@@ -380,8 +377,7 @@ def figure(c: PopulationsCompared) -> Chart:
         panel.dots(middle[~doubted], places[~doubted], "posterior", 3.0)
         panel.dots(middle[doubted], places[doubted], "centre", 5.5, kind="rings")
         panels.append(panel)
-    height = (2.0 + 0.6 * len(c.populations)) * POINTS
-    return in_columns(panels, height, width=COLUMN * (2 if len(panels) > 1 else 1))
+    return in_columns(panels, (2.0 + 0.6 * len(c.populations)) * POINTS)
 
 
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
@@ -433,9 +429,9 @@ def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
         return f"The groups are not compared: {error}."
 
 
-def group_sentences(of: PopulationsCompared, called: Mapping[str, str] = NAMES) -> Iterator[str]:
+def group_sentences(of: PopulationsCompared, names: Names = NAMES) -> Iterator[str]:
     """The answer, and which number the straight line is of."""
-    yield from sentences(of, called)
+    yield from sentences(of, names)
     if of.lines:
         yield f"The number of the straight line is that of the names of the groups, in {numbers_of(of.populations)[1]}."
 

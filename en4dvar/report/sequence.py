@@ -26,13 +26,14 @@ from en4dvar.plumbing.files import inside, write_text
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
-from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, interval, stacked
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
 from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, render_latex
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import axis_label, fixed, number_like, percent, plain_number, pretty_unit, shown, with_unit
+from en4dvar.results.declared import Names
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import MEAN, estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
@@ -89,6 +90,11 @@ def variables(data: Group) -> list[tuple[str, str, str]]:
     """Name, unit and the unit shown of each variable of the state."""
     columns = "state", "units", "display_units" if "display_units" in data else "units"
     return list(zip(*(map(str, data[column].values) for column in columns), strict=True))
+
+
+def symbols(data: Group) -> list[str]:
+    """How the variables of the state are written; in files of earlier versions by their names."""
+    return list(map(str, data["symbol" if "symbol" in data else "state"].values))
 
 
 def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
@@ -180,8 +186,9 @@ class SequenceOutcome(SeriesResult):
 
 
 def _ended(data: Group) -> dict[str, Any]:
+    written = Names(zip(map(str, data["state"].values), symbols(data), strict=True))
     at_end = [
-        (name, number_like(mean, std), number_like(std, std), pretty_unit(unit))
+        (written[name], number_like(mean, std), number_like(std, std), pretty_unit(unit))
         for name, mean, std, unit in islice(last_analysis(data), LISTED)
     ]
     rows = []
@@ -219,14 +226,14 @@ def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
     for i in chosen:
         name, unit, display = variables(data)[i]
         mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, display) for what in ("mean", "std"))
-        panel = Panel(ylabel=with_unit(name, display), xlim=span_of(time))
+        panel = Panel(ylabel=with_unit(symbols(data)[i], display), xlim=span_of(time))
         panel.band(time, *interval(mean, std, 2, bool(data["positive"].values[i])), "posterior", 0.25, "± 2 std")
         panel.line(time, mean, "posterior", 0.9, label=kind)
         if name in read_as:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, axis_label(data["time"], "time"), PAGE)
+    return stacked(panels, 2.8 * POINTS, axis_label(data["time"], "time"))
 
 
 def innovations(data: Group) -> Chart:
@@ -244,7 +251,7 @@ def innovations(data: Group) -> Chart:
         panel.rule(0, size=0.5)
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, axis_label(data["time"], "time"), PAGE)
+    return stacked(panels, 2.6 * POINTS, axis_label(data["time"], "time"))
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:

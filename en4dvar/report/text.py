@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.model.state import Array
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.results.declared import zero_of
 
 if TYPE_CHECKING:
@@ -46,6 +46,15 @@ def pretty_unit(unit: str) -> str:
     text = re.sub(r"(?<![A-Za-z])u(?=[A-Za-z])", "µ", unit.strip())
     text = re.sub(r"(?<=[A-Za-zµ])(?:\^|\*\*)?(-?\d+)(?![\d.])", lambda m: m[1].translate(_SUPERSCRIPT), text)
     return re.sub(r"\s*\*\s*|\s+", "·", text)
+
+
+def with_micro(words: object) -> str:
+    """``"at 18.2 us"`` → ``"at 18.2 µs"``, as the tables of a page write it.
+
+    >>> with_micro("1.4 um in 2 uses, 5 us")
+    '1.4 µm in 2 uses, 5 µs'
+    """
+    return re.sub(r"(?<=\d )u\w+\b", lambda m: pretty_unit(m[0]) if is_unit(m[0]) else m[0], str(words))
 
 
 def unit_behind(unit: str) -> str:
@@ -229,12 +238,13 @@ def symbol_html(symbol: str) -> Markup:
 
 
 def with_symbols(words: str) -> Markup:
-    r"""A sentence with mathtext symbols in it as HTML; everything else is escaped text.
+    r"""A sentence with mathtext symbols in it, and their exponents, as HTML; everything else is escaped text.
 
-    >>> str(with_symbols(r"$\mu$ of a < b"))
-    '<i>μ</i> of a &lt; b'
+    >>> str(with_symbols(r"$\mu$ of a < b")), str(with_symbols(r"$G$ · $\alpha$^0.23"))
+    ('<i>μ</i> of a &lt; b', '<i>G</i> · <i>α</i><sup>0.23</sup>')
     """
-    return Markup("").join(symbol_html(part) for part in re.split(r"(\$[^$]+\$)", words))
+    within = re.sub(r"\$\^(−?[\d.]+)", r"^{\1}$", words)
+    return Markup("").join(symbol_html(part) for part in re.split(r"(\$[^$]+\$)", within))
 
 
 def without_folders(text: object) -> str:

@@ -18,16 +18,15 @@ from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report import text
-from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import write_page
 from en4dvar.report.svg import svg
-from en4dvar.results.declared import parameter_of
+from en4dvar.results.declared import NAMES, Names, parameter_of
 from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
-NAMES: Mapping[str, str] = {}  # of parameters: how a page writes them; else they are as in the configuration
 NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
 DOUBTED = "Orange, without an interval: not to be trusted, because of its warnings."
 SHARED = "Median and 5–95 % of the shared parameters, each data set alone (grey) and all{} together. " + DOUBTED
@@ -154,8 +153,7 @@ def forest(
                 panel.dots(middle[has], -has - 0.3, "centre", 3.0, kind="rings")
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
         panels.append(panel)
-    height = (2.0 + 0.36 * min(count, 60)) * POINTS
-    return in_columns(panels, height, width=COLUMN * (2 if len(common) > 1 else 1))
+    return in_columns(panels, (2.0 + 0.36 * min(count, 60)) * POINTS)
 
 
 def fits(joint: StoredJoint) -> Chart | None:
@@ -219,42 +217,9 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
     return rows
 
 
-def sentences(stored: StoredPopulation, called: Mapping[str, str] = NAMES) -> tuple[str, ...]:
-    """The answer: one sentence a parameter, and what the data determine together only; ``called``: how a page writes
-    the names of parameters.
-    """
-    of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
-    free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
-    centres = of[stored.headline]
-    lines = []
-    for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
-        lines.append(_sentence(stored, centre, mean, spread, called))
-        if stored.common and not centre.untrusted:
-            of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-            lines.append(_in_parts(stored, centre, of_it, centre.std, called))
-        lines += _compared(stored, centre, called)
-    if stored.doubted:
-        words = "Counted only as far as the others bear them out, since warnings say that their readings are wrong"
-        lines.append(f"{words}: {', '.join(stored.doubted)}.")
-    odd = named(np.array([*stored.belongs.values()]), stored.odd_before)
-    if odd:
-        names = ", ".join(stored.datasets[i] for i in odd)
-        lines.append(f"Perhaps not of the population; these numbers count them only as far as they are: {names}.")
-    if "empirical" in stored.tree.children:
-        checked = [_of_sets(stored, centre, called) for centre in centres if not centre.untrusted]
-        lines += [f"Check without a model of the population: {words}." for words in checked]
-    lines += [_together(stored, combination, called) for combination in stored.combinations]
-    if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
-        words = f"the data leave {stored.headline} or spread open, or lie in its tail"
-        free = f"The result without the hyperprior of {stored.headline} and spread is not known: {words}."
-    else:
-        each = zip(free_of[stored.headline], free_of["between"], strict=True)
-        ranges = "; ".join(
-            f"{called.get(centre.name, centre.name)} {_range(centre)}, spread {_range(spread)}"
-            for centre, spread in each
-        )
-        free = f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {ranges}."
-    return (*lines, free)
+def sentences(stored: StoredPopulation, names: Names = NAMES) -> tuple[str, ...]:
+    """The answer: one sentence a parameter, and what the data determine together only."""
+    return tuple(_Answer(stored, names).sentences())
 
 
 def _range(row: ParameterSummary) -> str:
@@ -265,78 +230,108 @@ def _median(row: ParameterSummary) -> str:
     return text.quantity(row.q50, row.std, row.unit)
 
 
-def _sentence(
-    stored: StoredPopulation, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary,
-    called: Mapping[str, str],
-) -> str:  # fmt: skip
-    """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread beside."""
-    if centre.untrusted and "empirical" in stored.tree.children:
-        words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
-        return f"{centre.label}: {_of_sets(stored, centre, called)}; {words}."
-    spread = f"{_median(between)} ({_range(between)})"
-    draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
-    logarithmic = _logarithmic(draws[0])
-    if logarithmic:
-        low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
-        spread = f"{middle} ({low} … {high})"
-    what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
-    words = f"{centre.label} {called.get(centre.name, centre.name)} = {_median(centre)} (5–95 %: {_range(centre)}), "
-    words += f"the {what} of the population; from data set to data set it varies by {spread}"
-    if logarithmic and stored.headline == "median":
-        words += f"; its arithmetic mean is {_median(mean)} ({_range(mean)})"
-    if centre.untrusted:
-        return f"{words}; not to be trusted: see the warnings."
-    return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
+@dataclass(frozen=True)
+class _Answer:
+    """What is said of a population, parameters by their ``names``."""
 
+    stored: StoredPopulation
+    names: Names
 
-def _compared(stored: StoredPopulation, centre: ParameterSummary, called: Mapping[str, str]) -> Iterator[str]:
-    if centre.name not in stored.reference:
-        return
-    posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-    value, std = map(float, text.shown(posterior, stored.reference[centre.name]))
-    source = str(stored.tree.attrs.get("reference_source", ""))
-    stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
-    below = float(np.mean(text.shown(posterior) < value))
-    name = called.get(centre.name, centre.name)
-    words = f"reference: {name} = {stated}{text.unit_behind(centre.unit)}{f', {source}' if source else ''}"
-    side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
-    yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
+    def sentences(self) -> Iterator[str]:
+        stored, names = self.stored, self.names
+        of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
+        free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
+        centres = of[stored.headline]
+        for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
+            yield self._centre(centre, mean, spread)
+            if stored.common and not centre.untrusted:
+                of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
+                yield self._in_parts(centre, of_it, centre.std)
+            if centre.name in stored.reference:
+                yield self._compared(centre)
+        if stored.doubted:
+            words = "Counted only as far as the others bear them out, since warnings say that their readings are wrong"
+            yield f"{words}: {', '.join(stored.doubted)}."
+        odd = named(np.array([*stored.belongs.values()]), stored.odd_before)
+        if odd:
+            sets = ", ".join(stored.datasets[i] for i in odd)
+            yield f"Perhaps not of the population; these numbers count them only as far as they are: {sets}."
+        if "empirical" in stored.tree.children:
+            checked = [self._of_sets(centre) for centre in centres if not centre.untrusted]
+            yield from (f"Check without a model of the population: {words}." for words in checked)
+        yield from map(self._together, stored.combinations)
+        if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
+            words = f"the data leave {stored.headline} or spread open, or lie in its tail"
+            yield f"The result without the hyperprior of {stored.headline} and spread is not known: {words}."
+        else:
+            each = zip(free_of[stored.headline], free_of["between"], strict=True)
+            ranges = "; ".join(f"{names[c.name]} {_range(c)}, spread {_range(spread)}" for c, spread in each)
+            yield f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {ranges}."
 
+    def _centre(self, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary) -> str:
+        """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread."""
+        stored = self.stored
+        if centre.untrusted and "empirical" in stored.tree.children:
+            doubt = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)})"
+            return f"{centre.label}: {self._of_sets(centre)}; {doubt}: see the warnings."
+        spread = f"{_median(between)} ({_range(between)})"
+        draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
+        logarithmic = _logarithmic(draws[0])
+        if logarithmic:
+            low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
+            spread = f"{middle} ({low} … {high})"
+        geometric = logarithmic and stored.headline == "median"
+        what = "median (geometric mean)" if geometric else stored.headline
+        words = f"{centre.label} {self.names[centre.name]} = {_median(centre)} (5–95 %: {_range(centre)}), "
+        words += f"the {what} of the population; from data set to data set it varies by {spread}"
+        words += f"; its arithmetic mean is {_median(mean)} ({_range(mean)})" if geometric else ""
+        if centre.untrusted:
+            return f"{words}; not to be trusted: see the warnings."
+        return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
 
-def _in_parts(
-    stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float, called: Mapping[str, str]
-) -> str:
-    """What the interval is made of, where data sets have anything in common."""
-    stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
-    between, common = (text.quantity(part, std, mean.unit) for part in stds)
-    return (
-        f"Of this interval ± {between} comes from the data sets and how they differ, ± {common} from common quantities "
-        f"({', '.join(called.get(name, name) for name in stored.common)}), which more data sets do not reduce."
-    )
+    def _compared(self, centre: ParameterSummary) -> str:
+        posterior = self.stored.group("posterior")[f"{centre.name}_{self.stored.headline}"]
+        value, std = map(float, text.shown(posterior, self.stored.reference[centre.name]))
+        source = str(self.stored.tree.attrs.get("reference_source", ""))
+        stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
+        below = float(np.mean(text.shown(posterior) < value))
+        name, unit = self.names[centre.name], text.unit_behind(centre.unit)
+        words = f"reference: {name} = {stated}{unit}{f', {source}' if source else ''}"
+        side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
+        return f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
+    def _in_parts(self, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
+        """What the interval is made of, where data sets have anything in common."""
+        stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
+        between, common = (text.quantity(part, std, mean.unit) for part in stds)
+        return (
+            f"Of this interval ± {between} comes from the data sets and how they differ, ± {common} from common "
+            f"quantities ({self.names.of(self.stored.common)}), which more data sets do not reduce."
+        )
 
-def _of_sets(stored: StoredPopulation, centre: ParameterSummary, called: Mapping[str, str]) -> str:
-    """The median over the data sets one by one, which needs no model of how they vary."""
-    of = stored.group("empirical")[centre.name]
-    low, middle, high = text.shown(of)
-    std = (high - low) / 3.29
-    words = (
-        f"the median of {len(stored.datasets)} data sets one by one is {called.get(centre.name, centre.name)} = "
-        f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
-        "the share of its prior's variance that its data took away"
-    )
-    parts = _in_parts(stored, centre, of, std, called).removesuffix(".") if centre.untrusted and stored.common else ""
-    return f"{words}. {parts}" if parts else words
+    def _of_sets(self, centre: ParameterSummary) -> str:
+        """The median over the data sets one by one, which needs no model of how they vary."""
+        of = self.stored.group("empirical")[centre.name]
+        low, middle, high = text.shown(of)
+        std = (high - low) / 3.29
+        words = (
+            f"the median of {len(self.stored.datasets)} data sets one by one is {self.names[centre.name]} = "
+            f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
+            "the share of its prior's variance that its data took away"
+        )
+        if centre.untrusted and self.stored.common:
+            words += f". {self._in_parts(centre, of, std).removesuffix('.')}"
+        return words
 
-
-def _together(stored: StoredPopulation, combination: Combination, called: Mapping[str, str]) -> str:
-    """What is sharp: a product of powers where all are logarithms."""
-    names = " and ".join(called.get(name, name) for name, _ in combination.parts)
-    if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
-        return f"The data determine a combination of {names} better than each of them."
-    powers = ((called.get(name, name), text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
-    product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-    return f"The data determine {product}, to {text.percent(combination.std)}, better than {names}."
+    def _together(self, combination: Combination) -> str:
+        """What is sharp: a product of powers where all are logarithms."""
+        posterior, parts = self.stored.group("posterior"), dict(combination.parts)
+        names = self.names.of(parts, " and ")
+        if not all(_logarithmic(posterior[f"{name}_mean"]) for name in parts):
+            return f"The data determine a combination of {names} better than each of them."
+        powers = ((self.names[name], text.quantity(exponent, 0.1)) for name, exponent in parts.items())
+        product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
+        return f"The data determine {product}, to {text.percent(combination.std)}, better than {names}."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:

@@ -151,6 +151,19 @@ def parameter_of(name: str, about: Mapping[str, Any]) -> Parameter:
     return Parameter(name, str(about["units"]), label=label, symbol=symbol, display_unit=str(about["display_units"]))
 
 
+class Names(dict[str, str]):
+    """Parameter → how a page writes it; one that is not among them is written as in the configuration."""
+
+    def __missing__(self, name: str) -> str:
+        return name
+
+    def of(self, parameters: Iterable[str], between: str = ", ") -> str:
+        return between.join(self[name] for name in parameters)
+
+
+NAMES = Names()
+
+
 def zero_of(time: Variable) -> float:
     """What the clock of the data shows at the model's time zero, in the unit of the times of readings."""
     return float(time.attrs.get("time_zero", 0.0))

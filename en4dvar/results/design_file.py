@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from en4dvar.estimation.design.evaluate import FAN, Evaluated
 from en4dvar.estimation.design.nested import Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.results.declared import text
+from en4dvar.results.declared import Names, text
 from en4dvar.results.netcdf import Group, read_groups, to_bytes, understood, variable
 
 FILE = "design.nc"
@@ -72,7 +72,8 @@ class DesignRow:
 class Asked:
     """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, the knobs and the laws; the
     label and the ``axes`` of what is seen, time and observable, each with its units (stored, shown); what is
-    ``enough``, nats; what is ``wanted``, as it is written, and for it all ``others`` with their units (stored, shown).
+    ``enough``, nats; what is ``wanted``, as it is written, and for it all ``others`` with their units (stored, shown)
+    and symbols.
     """
 
     parameters: tuple[str, ...]
@@ -86,6 +87,16 @@ class Asked:
     enough: float
     wanted: Mapping[str, str] = field(default_factory=dict)
     others: tuple[tuple[str, str, str], ...] = ()
+    other_symbols: tuple[str, ...] = ()
+
+    @property
+    def written(self) -> "Asked":
+        """The same with symbols in place of names, as a page writes them."""
+        names = Names(zip(self.parameters, self.symbols, strict=True))
+        beside = self.other_symbols or [name for name, *_ in self.others]  # which earlier versions did not store
+        others = tuple((s, unit, shown) for s, (_, unit, shown) in zip(beside, self.others, strict=True))
+        wanted = {names[name]: text for name, text in self.wanted.items()}
+        return replace(self, parameters=self.symbols, wanted=wanted, others=others)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.model.forward import ForwardModel, Observable, StateField
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Field, Shown
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
 from en4dvar.results.netcdf import Group, netcdf_attributes
@@ -126,11 +126,12 @@ def _state_read(observable: Observable, model: ForwardModel) -> str:
     return name if single else ""
 
 
-def _display_units(r: SeriesResult) -> list[str]:
+def _states_shown(r: SeriesResult) -> list[Shown]:
+    """What says how each variable of the state is shown: a parameter, the observable that reads it, or its name."""
     model = r.problem.start.model
-    shown = {p.name: p.display_unit for p in model.parameters}
-    shown |= {name: o.display_unit for o in _columns(r) if (name := _state_read(o, model))}
-    return [shown.get(name, unit) for name, unit in _states(r)]
+    known: dict[str, Shown] = {p.name: p for p in model.parameters}
+    known |= {_state_read(o, model): o for o in _columns(r)}
+    return [known.get(name) or Field(name, unit=unit) for name, unit in _states(r)]
 
 
 def _positive(problem: SeriesProblem) -> Any:
@@ -157,7 +158,10 @@ SEQUENCE: Table = (
 SEQUENCE_COORDINATES: Table = (
     _coordinate("time", "time", "observation time", lambda r: r.problem.series.times, CLOCK),
     *STATE_COORDINATES,
-    _coordinate("display_units", "state", "unit of the variable in reports", lambda r: text(_display_units(r))),
+    _coordinate("display_units", "state", "unit of the variable in reports",
+                lambda r: text(s.display_unit for s in _states_shown(r))),
+    _coordinate("symbol", "state", "how the variable is written in reports",
+                lambda r: text(s.symbol for s in _states_shown(r))),
     _coordinate("positive", "state", "1: the ensemble holds its logarithm", lambda r: _positive(r.problem)),
     _coordinate("observation", "observation", "what was observed", lambda r: text(r.problem.series.names)),
     _coordinate("observation_units", "observation", "unit of the observation",

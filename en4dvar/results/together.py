@@ -23,7 +23,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.declared import parameter_of, text
+from en4dvar.results.declared import Names, parameter_of, text
 from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, tree_of, understood, variable
 
 if TYPE_CHECKING:
@@ -348,9 +348,10 @@ class StoredPopulation(StoredGroups):
         return tuple(str(self.tree.attrs["parameters"]).split())
 
     @property
-    def symbols(self) -> dict[str, str]:
+    def symbols(self) -> Names:
         """Parameter or common quantity → how it is written in a figure."""
-        return {str(name): str(values.attrs["symbol"]) for name, values in self.group("posterior").data_vars.items()}
+        variables = self.group("posterior").data_vars.items()
+        return Names((str(name), str(values.attrs["symbol"])) for name, values in variables)
 
     @property
     def headline(self) -> str:

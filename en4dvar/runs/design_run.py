@@ -146,6 +146,7 @@ class DesignKind(RunKind[Designs]):
             seen=seen.label,
             wanted={name: str(text) for name, text in design.wanted.items()},
             others=tuple((p.name, p.unit, p.display_unit) for p in others),
+            other_symbols=tuple(p.symbol for p in others),
             axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
         )
 

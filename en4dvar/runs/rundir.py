@@ -74,7 +74,8 @@ class RunDirectory:
                     held.callback(_remove_if_empty, home)
                 held.enter_context(locked(home))
                 resumed = mode in ("report", "beside") or (mode == "resume" and holds_run(home))
-                directory = cls(path, home, _opened(home, mode) if resumed else _prepare(home, mode), resumed)
+                work = _opened(path, mode) if resumed else _prepare(path, mode)  # which tell the path as it was given
+                directory = cls(path, home, work.absolute(), resumed)
                 if mode == "beside":
                     directory._refuse_foreign(files)
                 elif not resumed:

@@ -188,7 +188,7 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
         if len({column.name for column in columns}) < len(columns):  # series of several files
             columns = [replace(column, name=plan.name) for column, plan in zip(columns, series, strict=True)]
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
-    truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
+    truth = ", ".join(f"{name} = {v:.9g} {units[name]}".removesuffix(" 1") for name, v in simulation.theta.items())
     columns = [time, *columns]
     comments = [*comment.splitlines(), f"parameters: {truth}", ", ".join(f"{c.name} in {c.unit}" for c in columns)]
     return _commented(comments, columns, [simulation.times, *simulation.series.values()], ".9g")

@@ -183,7 +183,7 @@ def combined(study: Study, fit: Fit) -> Chart:
             panel.dots(truth, np.full(len(truth), 0.04 * top), "centre", 6.0, label="truths", kind="ticks")
         panel.ylim = 0.0, top
         panels.append(panel)
-    return in_columns(panels, 0.43 * COLUMN)
+    return in_columns(panels, 0.43 * COLUMN, width=COLUMN)
 
 
 def iterations(fit: Fit) -> Chart:
@@ -199,7 +199,7 @@ def iterations(fit: Fit) -> Chart:
             panel.dots([len(path) - 1], path[-1:], "posterior", 1.6)
         panel.rule(guess, "centre", 0.8)
         panels.append(panel)
-    return in_columns(panels, 0.43 * COLUMN)
+    return in_columns(panels, 0.43 * COLUMN, width=COLUMN)
 
 
 def population(study: Study) -> Chart:

@@ -232,7 +232,7 @@ async function readTable() {
     $(id).value = known[id] || (!table?.tracked && own) || "";
   }
   $("about-table").textContent = !table ? "" : table.tracked ? "A table of 'en4dvar track': it says its columns and units itself."
-    : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. ${table.words.length ? `Words stand in ${table.words.join(", ")}: no times or radii. ` : ""}Units are never guessed: give them.`;
+    : `${table.files > 1 ? `${table.files} files, of which this is ${table.file}` : table.file}${table.decimal === "," ? ", with decimal commas" : ""}. ${table.words.length ? `Words stand in ${table.words.join(", ")}: no times or radii. ` : ""}Units are those at the end of a column's name, as in t_us, or what you give; they are never guessed.`;
   plotTable();
 }
 
@@ -299,6 +299,13 @@ for (const id of ["table", "sheet"]) $(id).addEventListener("change", readTable)
 $("config").addEventListener("change", readConfig);
 // What a hand changes ends a message about what was there; it may itself be the reason of a new one.
 document.addEventListener("change", (event) => { if (event.bubbles) say(""); }, true);
+// A browser shows a file that is dropped on a page in the page's place.
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => {
+  event.preventDefault();
+  const names = [...event.dataTransfer.files].map((file) => file.name).join(", ");
+  if (names) say(`Nothing is sent to the page: put ${names} into the folder ${state.folder}, and the lists of movies and tables show it.`);
+});
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
 fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
 window.addEventListener("beforeunload", (event) => { if ($("text").value !== before || Object.keys(drafts).length) event.preventDefault(); });

@@ -256,3 +256,19 @@ def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width)
     require_accessible(page)
     for landmark in ("main", "h1", "html[lang=en]"):
         assert page.locator(landmark).count() == 1
+
+
+def test_a_file_that_is_dropped_on_the_page_is_told_where_to_go(visit, serve, german):
+    """The browser showed the file in the page's place; of a single table the page said "1 file(s)"."""
+    page = visit(serve(german))
+    drop = """() => {
+      const dataTransfer = new DataTransfer(), how = { dataTransfer, bubbles: true, cancelable: true };
+      dataTransfer.items.add(new File(["t_us,R_um"], "mine.csv"));
+      return ["dragover", "drop"].map((kind) => !document.body.dispatchEvent(new DragEvent(kind, how)));
+    }"""
+    assert page.evaluate(drop) == [True, True]  # what the browser would do is prevented
+    assert f"put mine.csv into the folder {german}" in page.inner_text("#message")
+    (german / "mine.csv").write_text("t_us,R_um\n0,1\n1,2\n2,3\n")
+    until(page, "[...$('table').options].some((o) => o.value === 'mine.csv')")
+    page.select_option("#table", "mine.csv")
+    until(page, "document.getElementById('about-table').innerText.startsWith('mine.csv. Units are those at')")

@@ -103,6 +103,21 @@ def column(page, i):
     return page.locator("table.sets tbody tr").evaluate_all(f"rows => rows.map(r => r.cells[{i}].textContent.trim())")
 
 
+def test_the_table_of_a_campaign_of_five_parameters_fits_a_screen(opened, pages):
+    script = """() => {
+      const table = document.querySelector("table.campaign");
+      for (const row of table.rows) {
+        const cell = row.cells[2];
+        for (let i = row.cells.length; i < 12; i++) cell.after(cell.cloneNode(true));
+        row.cells[0].textContent = "bubble_17";
+        const told = ["0.53 ± 0.12", "0.0317 ± 0.0075", "0.0991 ± 0.0048", "0.51 ± 0.12", "−0.011 ± 0.012"];
+        if (cell.tagName === "TD") told.forEach((words, i) => { row.cells[i + 2].textContent = words; });
+      }
+      return [table.rows[1].cells.length, table.parentElement.scrollWidth - table.parentElement.clientWidth];
+    }"""
+    assert opened(pages["campaign"], width=1200).page.evaluate(script) == [12, 0]
+
+
 @pytest.mark.parametrize("width", [360, 700, 960, 1100, 1200])
 def test_the_table_of_parameters_fits_a_screen_with_long_values(opened, pages, width):
     script = """() => {

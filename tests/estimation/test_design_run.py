@@ -289,13 +289,15 @@ def test_what_is_taken_to_the_lab(tmp_path):
 def test_units_of_knobs_on_the_page_are_as_of_all_figures(tmp_path):
     """An axis said "every [us]"."""
     every = {"key": "design.times.step", "values": ["400000 us", "800000 us"]}
-    found, directory = run_design(_plan(knobs={"every": every}, method="laplace"), out=tmp_path / "out", overrides=PAGE)
+    plan, command = _plan(knobs={"every": every}, method="laplace"), f"en4dvar design {tmp_path}/plan.yaml"
+    found, directory = run_design(plan, out=tmp_path / "out", overrides=PAGE, command=command)
     (panel,) = gains(found).rows[0].panels[:1]
     assert panel.xlabel == "every (µs)"
     page = (directory / "design.html").read_text(encoding="utf-8")
     assert "every 400000 µs" in page
     assert "every 400000 µs" in design_table(found)
     assert " us<" not in page
+    assert "en4dvar design …/plan.yaml" in page  # no folder of the machine
     assert with_pretty_unit("neo-hookean") == "neo-hookean"
     assert with_pretty_unit("0.3") == "0.3"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_information import MEAN, STD, _problem
@@ -9,6 +11,7 @@ from test_information import MEAN, STD, _problem
 from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.design import design_table
+from en4dvar.results.design_file import load_designs
 from en4dvar.runs.design_run import run_design
 
 SIZES = SampleSizes(draws=20)
@@ -117,7 +120,11 @@ def test_it_is_said(tmp_path, error, wanted, words):
     """The level is as badly known as the scale; 1e-3 and the prior of the level change the third digit."""
     found, directory = run_design(_plan(error, wanted), out=tmp_path / "out", overrides={"output.report": True})
     assert words in design_table(found)
-    assert words in (directory / "design.html").read_text()
+    written = words.replace("reading_scale", "<i>b</i>").replace("level", "<i>x</i><sub>0</sub>")
+    assert written in (directory / "design.html").read_text(encoding="utf-8")
+    held = load_designs(directory / "design.nc").asked
+    earlier = replace(held, other_symbols=()).written  # as of a file of an earlier version
+    assert [name for name, *_ in earlier.others] == ["reading_scale"]
     assert "level_needs_reading_scale_factor" in (directory / "designs.csv").read_text()
 
 

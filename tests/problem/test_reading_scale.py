@@ -126,4 +126,5 @@ def test_from_yaml_to_the_result_and_the_simulation(tmp_path: Path) -> None:
         truth = ["--set", "parameters.k=2 N/m", "--set", f"parameters.reading_scale={factor}"]
         assert CliRunner().invoke(main, ["simulate", str(config), *truth, "--out", str(out)]).exit_code == 0
         simulated.append(np.loadtxt(out.read_text().splitlines()[-31:], delimiter=",")[:, 1])
+        assert f"reading_scale = {factor}\n" in out.read_text()  # without the unit 1
     np.testing.assert_allclose(simulated[1], 1.5 * simulated[0], rtol=1e-4, atol=1e-3)

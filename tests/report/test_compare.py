@@ -21,6 +21,7 @@ from en4dvar.report.compare import (
     compare_runs,
     comparison_table,
     overlay,
+    preferred,
     with_evidences,
     write_comparison,
 )
@@ -80,6 +81,10 @@ def test_other_evidences_are_judged_as_those_of_the_results(tmp_path):
     assert better.of("set1") == comparison.of("set1")
     assert [s.probability for s in better.of(ALL)] == [0, 1]
     assert better.of(ALL)[1].log_evidence == comparison.of("set1")[1].log_evidence + 1e3
+
+
+def test_no_minus_stands_before_a_difference_of_zero():
+    assert preferred("a", "b", -0.0) == "undecidable: a and b differ by 0.00 in log-evidence"
 
 
 def test_equal_models_are_undecidable_on_the_command_line(tmp_path):

@@ -28,6 +28,7 @@ from en4dvar.report.populations import (
     sentences,
 )
 from en4dvar.report.text import with_symbols
+from en4dvar.results.declared import Names
 from en4dvar.results.together import load_population
 from en4dvar.runs.design_run import run_design
 from en4dvar.runs.runner import run_campaign
@@ -249,7 +250,7 @@ def test_words_of_a_difference():
 def test_a_page_writes_parameters_by_their_symbols_and_the_terminal_by_their_names(gels):
     """The page of one bubble says μ where that of its population said mu."""
     of = compare_populations(only(gels), known={"soft_only": {"k": "1.8 ± 0.1 N/m"}})
-    of = replace(of, symbols={"k": r"$\kappa$", "c": "$c_1$"}, common=("c",))
+    of = replace(of, symbols=Names({"k": r"$\kappa$", "c": "$c_1$"}), common=("c",))
     plain, written = list(sentences(of)), list(sentences(of, of.symbols))
     assert plain[0].startswith("k of soft_only")
     assert "alike: c." in plain[1]

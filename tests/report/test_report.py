@@ -22,7 +22,7 @@ from en4dvar import report
 from en4dvar.diagnosis.diagnostics import chi2_interval, member_quantiles
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.executor import SerialExecutor, WorkerLostError
-from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior
 from en4dvar.report import write_pages
@@ -151,6 +151,12 @@ def with_parameters(analysis, *parameters):
     """The analysis as if its parameters were these."""
     terms = tuple(replace(t, parameter=p) for t, p in zip(analysis.problem.prior.terms, parameters, strict=False))
     return replace(analysis, problem=replace(analysis.problem, prior=Prior(terms)))
+
+
+def test_a_warning_has_the_units_of_the_page(write_run, analysis):
+    told = replace(analysis, cautions=(caution("misfit", "the reading at 18.2 us of data.path 'a 3 user'"),))
+    html = write_pages(write_run(told)).read_text(encoding="utf-8")
+    assert "the reading at 18.2 µs of data.path &#39;a 3 user&#39;" in html
 
 
 def test_a_symbol_that_is_the_label_is_said_once(write_run, analysis):

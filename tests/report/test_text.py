@@ -24,6 +24,16 @@ NAN = float("nan")
         (text.signed, [0.234, -4.0], ["+0.23", "−4"]),
         (text.fixed, [(-1.25, 1), (-0.01, 1), (NAN, 2)], ["-1.2", "0.0", "–"]),
         (text.symbol_html, [r"$\mu$", r"$R_{\mathrm{eq}}$", "<b>"], ["<i>μ</i>", "<i>R</i><sub>eq</sub>", "&lt;b&gt;"]),
+        (
+            text.with_micro,
+            ["1.4 um in 2 uses, at 18.2 us.", "set time_std: 0.1 us"],
+            ["1.4 µm in 2 uses, at 18.2 µs.", "set time_std: 0.1 µs"],
+        ),
+        (
+            text.with_symbols,
+            [r"$G$ · $\alpha$^0.23, $R_0$^−0.5 < R"],
+            ["<i>G</i> · <i>α</i><sup>0.23</sup>, <i>R</i><sub>0</sub><sup>−0.5</sup> &lt; R"],
+        ),
         (text.math_pieces, [r"R_{\mathrm{eq}}"], [[("", "R"), ("_", "eq")]]),
         (is_math, [r"$\mu_{max}$", r"$\frac{1}{2}R^2$", r"$\input{x}$", "$a}b{c$"], [True, True, False, False]),
         (latex_unit, ["um", "Pa s", "m s-1", "%", "1"], [r"$\mu$m", r"Pa\,s", r"m\,s$^{-1}$", r"\%", ""]),

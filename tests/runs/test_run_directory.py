@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -238,6 +239,17 @@ def test_a_run_that_could_not_begin_is_begun_by_resume(tmp_path, monkeypatch, fa
     assert out.exists() == (failing != LISTING)
     monkeypatch.undo()
     assert run(configuration(path, out), resume=True).name == "toy"
+
+
+@pytest.mark.parametrize("mode", ["new", "resume"])
+def test_a_directory_is_named_as_it_was_given(tmp_path, monkeypatch, mode):
+    """The message about a relative path gave an absolute one."""
+    monkeypatch.chdir(tmp_path)
+    Path("out").mkdir()
+    Path("out/mine.txt").touch()
+    words = "not empty, and not of a run; --out out_2 keeps both" if mode == "new" else "holds no run"
+    with pytest.raises(OutputError, match=f"^out: {words}$"), RunDirectory.open("out", mode):
+        pass
 
 
 def test_resume_needs_a_run_or_nothing(tmp_path):

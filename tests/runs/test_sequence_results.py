@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import drift_series
+import linear_drift
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,9 +19,17 @@ from run_files import kill_after_writes, resumed_until_done, run_cli
 from scipy.stats import multivariate_normal
 
 from en4dvar.data.noise import Correlation
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import DataError, OutputError
-from en4dvar.report.sequence import averaged, compare_sequences, cycles_table, sequences_table
-from en4dvar.results.netcdf import Group, variable
+from en4dvar.report.sequence import (
+    averaged,
+    compare_sequences,
+    cycles_table,
+    sequence_figures,
+    sequences_table,
+    symbols,
+)
+from en4dvar.results.netcdf import Group, read_groups, variable
 from en4dvar.results.series_file import MEAN
 from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.rerun import rerun
@@ -191,6 +200,19 @@ def test_a_score_has_the_digits_that_its_scatter_over_the_cycles_allows():
     assert 0.85 < np.sqrt(np.mean(errors**2)) / means.std() < 1.15
     single = Group({"s": variable("time", [3.0], "1", "RMSE", **{MEAN: 3.0})}, attrs={"burn_in": 0})
     assert averaged(single, "s") == (3.0, pytest.approx(0.3))
+
+
+def test_the_page_of_a_sequence_writes_parameters_by_their_symbols(folder, monkeypatch):
+    monkeypatch.setattr(linear_drift.Drift, "parameters", (Parameter("c", "1", label="rate", symbol=r"$\kappa$"),))
+    run_dir, _ = conducted(output={"report": True})
+    page = (run_dir / "report.html").read_text(encoding="utf-8")
+    assert '<td class="words">x</td>' in page
+    assert '<td class="words"><i>κ</i></td>' in page
+    assert "of 1 quantity<" in page
+    held = read_groups(run_dir / "sequence.nc")["/"]
+    assert [chart.rows[0].panels[0].ylabel for _, _, chart in sequence_figures(held)][:2] == ["x", r"$\kappa$"]
+    before = Group(held.variables, {name: v for name, v in held.coords.items() if name != "symbol"}, held.attrs)
+    assert symbols(before) == ["x", "c"]  # a file of an earlier version
 
 
 def test_the_page_of_a_sequence_has_the_digits_of_the_spread(folder):
