@@ -256,3 +256,24 @@ def test_the_truths_of_a_simulated_campaign_are_no_data_set(tmp_path: Path) -> N
         assert [*data_files(inverse_plan(load_config("twin.yaml")))] == ["truth"]
     done = call("init", "--data", folder / "answers*.csv", "--out", "none.yaml")
     assert (done.exit_code, "no file matches" in done.stderr) == (2, True)
+
+
+def test_units_tell_two_columns_whose_names_are_in_any_language(tmp_path: Path) -> None:
+    code, output = told(tmp_path, rows("時間 [us],半径 [um]\n", radii()))
+    assert code == 0, output
+    code, output = told(tmp_path, rows("半径 [um],時間 [um]\n", radii()), "--force")
+    assert code == 2
+    assert "units are never guessed: add --time-column NAME" in output
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_a_folder_whose_files_have_other_units_says_what_to_do(tmp_path: Path) -> None:
+    folder = tmp_path / "gel"
+    folder.mkdir()
+    for name, head in (("a", "t_us,R_um\n"), ("b", "Zeit [us],Radius [um]\n"), ("c", "t [us],radius (um)\n")):
+        (folder / f"{name}.csv").write_text(rows(head, radii()), encoding="utf-8")
+    done = call("init", "--data", folder)
+    assert done.exit_code == 0, done.output
+    assert "c.csv: no column 'R_um'; the columns are: t [us], radius (um)" in done.stderr
+    assert "2 of 3 files are left out" in done.stderr
+    assert "here 't_us' and 'R_um'; write the others under these names, in the same units" in done.stderr

@@ -92,6 +92,8 @@ class Asked:
             if len(names) == 2:  # one tells what the other is
                 first, second = names
                 other = {first: second, second: first}
+                timed = [name for name in names if name != radius and self._unit(name, "s")]
+                time = time or (timed[0] if len(timed) == 1 else None)  # words of any language, with a unit
                 radius = radius or other.get(time or "")
                 if not time and radius and (self.frame_rate is None or np.all(np.diff(names[other[radius]]) > 0)):
                     time = other[radius]

@@ -155,6 +155,12 @@ def propose_config(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
     )
     readings, unusable = histories(files, replace(source, layout=replace(layout, outliers="leave out")))
+    if len(unusable) > len(readings):
+        names = " and ".join(repr(name) for name in (*(time or ())[:1], radius[0]))
+        unusable.append(
+            f"{len(unusable)} of {len(files)} files are left out: all files of a folder are read by the same names "
+            f"and units, here {names}; write the others under these names, in the same units, and propose again"
+        )
     common = _largest(readings, TRACKED_COMMON) if errors else 0.0
     proposal = propose(
         {name: (series.times, series.values) for name, series in readings.items()},
