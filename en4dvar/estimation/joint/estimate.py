@@ -46,7 +46,8 @@ class JointEstimate:
     ``members`` in units of the prior, ``mode`` where J is lowest, ``chi2`` (E,) per observation there, of others than
     odd experiments without these, ``forecasts`` of the N members and, last, the mode, each read at ``grids`` too;
     ``cautions`` why not to trust it. ``agreement`` of each experiment with all others; ``without`` the oddest of them
-    the same estimate, None where none is odd.
+    the same estimate, None where none is odd. Where one is, members are those of the Gaussian about the mode: no
+    interval with an odd experiment is quoted, and to draw them would take as long as those without it.
     """
 
     joint: JointProblem
@@ -132,17 +133,31 @@ class _Estimate:
         self.objective = JointObjective(joint, self.experiments, scheme)
         self.other_runs = 0
 
-    def result(self, singles: Sequence[Single], most: int | None = None) -> JointEstimate:
-        """Of which at ``most`` so many experiments are left out as odd."""
-        joint, experiments = self.joint, self.experiments
+    def result(self, singles: Sequence[Single]) -> JointEstimate:
         if self.samples:
-            runs = f"{rounded(*span_of_runs(len(experiments)))} forward runs, beside some thousands of the search"
-            self.tell(f"cost: members of {len(experiments)} data sets are drawn by about {runs}")
+            runs = f"{rounded(*span_of_runs(len(self.experiments)))} forward runs, beside some thousands of the search"
+            self.tell(f"cost: members of {len(self.experiments)} data sets are drawn by about {runs}")
         singles = singles or self._singles()
+        return self._concluded(singles, *self._minimised(singles), int(AT_MOST * len(self.experiments)))
+
+    def _minimised(self, singles: Sequence[Single]) -> tuple[list[JointDescent], JointDescent]:
+        """The descents, and that of lowest J."""
         descents = self._descents(self._starts(singles))
         lowest = self._challenged(min(descents, key=lambda descent: descent.at.cost))
         self.tell(f"J {lowest.at.cost:.4g} after {counted(len(lowest.costs) - 1, 'iteration')}, {lowest.stop}")
-        members, cautions = self._members(lowest)
+        return descents, lowest
+
+    def _concluded(
+        self, singles: Sequence[Single], descents: Sequence[JointDescent], lowest: JointDescent, most: int
+    ) -> JointEstimate:
+        """The estimate, and that without the experiments, at ``most`` so many, that are odd."""
+        joint, experiments = self.joint, self.experiments
+        own = [single.mode[joint.columns(e)[1]] for e, single in enumerate(singles)]  # J_o + J_b of these, alone
+        each = zip(experiments, singles, own, strict=True)
+        alone = np.array([float(e.costs(s.mode[None])[0] + 0.5 * v @ v) for e, s, v in each])
+        said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
+        without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
+        members, cautions = self._members(lowest, drawn=self.samples and not without)
         grids = tuple(plotting_times(problem) for problem in joint.experiments)
         forecasts = tuple(
             experiment.run(_points(joint, members, lowest.at.place, experiment.e), grids[experiment.e])
@@ -160,12 +175,6 @@ class _Estimate:
             words = f"none of {len(descents) - 1} further descents of the joint estimate ended in its lowest minimum"
             advice = "a lower one may not have been found: make the runs again with narrower priors"
             cautions.append(replace(caution("starts-disagree", words), advice=advice))
-        most = int(AT_MOST * len(experiments)) if most is None else most
-        own = [single.mode[joint.columns(e)[1]] for e, single in enumerate(singles)]  # J_o + J_b of these, alone
-        each = zip(experiments, singles, own, strict=True)
-        alone = np.array([float(e.costs(s.mode[None])[0] + 0.5 * v @ v) for e, s, v in each])
-        said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
-        without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
         costs = [form.cost + 0.5 * float(v @ v) for form, v in zip(lowest.at.forms, lowest.at.place.own, strict=True)]
@@ -188,7 +197,7 @@ class _Estimate:
             converged=lowest.converged,
             stop_reason=lowest.stop,
             log_evidence=members.log_evidence - normalisation,
-            forward_runs=self.other_runs + sum(each.composite.forward_runs for each in experiments),
+            forward_runs=self.forward_runs,
             cautions=tuple(cautions),
             agreement=agreed,
             without=without,
@@ -204,9 +213,12 @@ class _Estimate:
         kept = [i for i in range(len(singles)) if i != e]
         self.tell(f"once more without {self.joint.names[e]}")
         estimate = _Estimate(self.joint.of(kept), self.settings, self.seed, self.executor, self.tell)
-        rest = estimate.result([singles[i] for i in kept], most - 1)
-        self.other_runs += rest.forward_runs
-        return rest if is_odd(said, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
+        others = [singles[i] for i in kept]
+        descents, lowest = estimate._minimised(others)
+        odd = is_odd(said, e, 2 * (cost - lowest.at.cost - alone[e]))
+        rest = estimate._concluded(others, descents, lowest, most - 1) if odd else None
+        self.other_runs += estimate.forward_runs
+        return rest
 
     def _singles(self) -> list[Single]:
         settings = replace(self.settings, refine="none", emulator="off", what_if=False)
@@ -269,12 +281,16 @@ class _Estimate:
 
     @property
     def samples(self) -> bool:
-        """Whether members are drawn by importance."""
+        """Whether members are drawn by importance where no experiment is odd."""
         return self.settings.refine != "none" and all(problem.model.cheap for problem in self.joint.experiments)
 
-    def _members(self, lowest: JointDescent) -> tuple[JointMembers, list[Caution]]:
+    @property
+    def forward_runs(self) -> int:
+        return self.other_runs + sum(each.composite.forward_runs for each in self.experiments)
+
+    def _members(self, lowest: JointDescent, drawn: bool) -> tuple[JointMembers, list[Caution]]:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
-        if not self.samples:
+        if not drawn:
             return laplace, []
         members = sampled(self.experiments, lowest.at, self.seed, self.settings.members, self.tell)
         if members is not None:
