@@ -39,6 +39,21 @@ def test_the_top_lies_where_its_errors_say(per_collapse: float, noise_std: float
         assert np.median([one.time_std for one in tops]) < 0.5 * largest
 
 
+@pytest.mark.parametrize(("per_collapse", "noise_std"), [(9, 0.014), (20, 0.005), (20, 0.014), (60, 0.005), (60, 0.03)])
+def test_of_a_film_that_begins_behind_the_top_its_time_is_open_by_what_readings_leave_and_no_more(
+    per_collapse: float, noise_std: float
+) -> None:
+    """A sixth of a collapse time late: it lies within 5 to 95 % of its prior, which is no longer than the collapse."""
+    stream, tops = np.random.default_rng(13), list[Top]()
+    for _ in range(60):
+        t, r = history(stream, per_collapse, noise_std, -0.15)
+        tops.append(top(t, r, noise_std))
+    prior_std = TOP_WIDTH * np.array([one.time_std for one in tops])
+    assert np.mean(np.abs([one.time for one in tops]) > 1.645 * prior_std) < 0.1
+    assert np.median(prior_std) < 0.45
+    assert prior_std.max() < 0.9147
+
+
 @pytest.mark.parametrize("grown", [0.5, 0.8])
 @pytest.mark.parametrize("per_collapse", [9, 20, 60])
 def test_where_readings_are_exact_the_top_is_off_by_what_growth_differs(per_collapse: float, grown: float) -> None:

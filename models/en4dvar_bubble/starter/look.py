@@ -33,6 +33,7 @@ LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, o
 FEWEST, CUBIC = 5, 8  # readings through which a parabola and a cubic are laid
 AGREE = 2.0  # standard deviations
 FORM = 0.002  # of the height: what R^{5/2} is not a polynomial by
+LATE = 0.12  # collapse times: the std of a top of which nothing else is known; at three of them R has fallen by 6 %
 CHOSEN, ONE_SIDED = 1.3, 2.5  # errors of a window that the readings chose themselves are larger by these factors
 
 
@@ -52,11 +53,15 @@ class Top:
 
 def top(times: Array, radius: Array, scatter: float) -> Top:
     """Of a history ``times`` (K,) s, ``radius`` (K,) m without bad readings, whose errors have the std ``scatter``."""
-    reading = int(np.argmax(radius))
-    estimates = list(_estimates(times, radius, scatter))
-    if not estimates:  # a few readings between which anything may lie
-        step = float(np.median(np.diff(times)))
-        return Top(float(times[reading]), float(radius[reading]), step, 0.03 * float(radius[reading]), reading)
+    reading, late, estimates = int(np.argmax(radius)), math.nan, list[tuple[Array, Array]]()
+    with suppress(DataError):
+        seen = lobe(times, radius)
+        late, estimates = LATE * seen.t_c, list(_estimates(times, radius, scatter, seen))
+    if not estimates:  # a few readings between which anything may lie, or a history that begins behind the top
+        time_std = np.fmax(np.median(np.diff(times)), late)
+        return Top(
+            float(times[reading]), float(radius[reading]), float(time_std), 0.03 * float(radius[reading]), reading
+        )
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     chosen = estimates[0]
     for value, std in estimates:
@@ -67,15 +72,13 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
             chosen = value, std
     value, std = chosen
     wider = CHOSEN if np.sum(times < value[0]) > 1 else ONE_SIDED
-    return Top(float(value[0]), float(value[1]), wider * float(std[0]), wider * float(std[1]), reading)
+    time_std, height_std = wider * std
+    return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std), reading)
 
 
-def _estimates(times: Array, radius: Array, scatter: float) -> Iterator[tuple[Array, Array]]:
+def _estimates(times: Array, radius: Array, scatter: float, seen: Lobe) -> Iterator[tuple[Array, Array]]:
     """Time and height, and their std, by windows from narrow to wide."""
-    try:
-        seen, before = lobe(times, radius), 0
-    except DataError:
-        return
+    before = 0
     for share in WINDOWS:
         near = (np.abs(times - seen.t_max) <= share * seen.t_c) & (radius > LOWEST * seen.R_max)
         count = int(near.sum())
