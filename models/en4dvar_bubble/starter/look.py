@@ -55,8 +55,8 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
     """Of a history ``times`` (K,) s, ``radius`` (K,) m without bad readings, whose errors have the std ``scatter``."""
     reading, late, estimates = int(np.argmax(radius)), math.nan, list[tuple[Array, Array]]()
     with suppress(DataError):
-        seen = lobe(times, radius)
-        late, estimates = LATE * seen.t_c, list(_estimates(times, radius, scatter, seen))
+        excursion = lobe(times, radius)
+        late, estimates = LATE * excursion.t_c, list(_estimates(times, radius, scatter, excursion))
     if not estimates:  # a few readings between which anything may lie, or a history that begins behind the top
         time_std = np.fmax(np.median(np.diff(times)), late)
         return Top(
@@ -76,16 +76,16 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
     return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std), reading)
 
 
-def _estimates(times: Array, radius: Array, scatter: float, seen: Lobe) -> Iterator[tuple[Array, Array]]:
+def _estimates(times: Array, radius: Array, scatter: float, excursion: Lobe) -> Iterator[tuple[Array, Array]]:
     """Time and height, and their std, by windows from narrow to wide."""
     before = 0
     for share in WINDOWS:
-        near = (np.abs(times - seen.t_max) <= share * seen.t_c) & (radius > LOWEST * seen.R_max)
+        near = (np.abs(times - excursion.t_max) <= share * excursion.t_c) & (radius > LOWEST * excursion.R_max)
         count = int(near.sum())
         if count < FEWEST or count == before:
             continue
         before = count
-        if (estimate := _vertex(times[near], radius[near], scatter, seen.t_c)) is not None:
+        if (estimate := _vertex(times[near], radius[near], scatter, excursion.t_c)) is not None:
             yield estimate
 
 
