@@ -26,6 +26,8 @@ from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 
+pytestmark = pytest.mark.xdist_group("study")  # of which a run takes minutes: by one worker, not by each
+
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GELS = ("0.3 %", "1 %")
 

@@ -118,6 +118,7 @@ def test_the_cost_is_that_of_a_run(tmp_path: Path) -> None:
     assert int(told[2]) == pytest.approx(2 * int(told[1]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_doubt_is_told() -> None:
     """The larger number is, for a data set, within a factor of two of the runs of one that is sampled in doubt."""
     config = load_config(ROOT / "configs" / "combined_laser.yaml")

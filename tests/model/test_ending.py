@@ -119,6 +119,7 @@ def test_a_template_that_swells_is_refused(tmp_path: Path) -> None:
     assert psutil.Process().memory_info().rss - before < 300e6
 
 
+@pytest.mark.slow
 @pytest.mark.fault("program-output")
 def test_a_pattern_without_end_is_past_its_time(tmp_path: Path) -> None:
     outputs = {"y": {"file": "stdout", "pattern": r"(?:a*)*(\d)b"}}

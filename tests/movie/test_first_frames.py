@@ -42,18 +42,19 @@ def wrong(readings, radii):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "ratio", "upright", "off"),
     [
-        pytest.param((96, 128), 1.0, False, (0, 0), marks=pytest.mark.slow),
-        pytest.param((96, 128), 1.2, False, (0, 0), marks=pytest.mark.slow),
-        pytest.param((96, 128), 1.2, True, (0, 0), marks=pytest.mark.slow),
-        pytest.param((128, 128), 1.4, False, (0, 0), marks=pytest.mark.slow),
-        pytest.param((128, 96), 1.3, False, (0, 0), marks=pytest.mark.slow),
-        pytest.param((64, 192), 1.15, True, (0, 0), marks=pytest.mark.slow),
-        pytest.param((112, 160), 1.3, False, (0, 30), marks=pytest.mark.slow),
+        ((96, 128), 1.0, False, (0, 0)),
+        ((96, 128), 1.2, False, (0, 0)),
+        ((96, 128), 1.2, True, (0, 0)),
+        ((128, 128), 1.4, False, (0, 0)),
+        ((128, 96), 1.3, False, (0, 0)),
+        ((64, 192), 1.15, True, (0, 0)),
+        ((112, 160), 1.3, False, (0, 30)),
         ((112, 160), 1.2, False, (45, 10)),
-        pytest.param((84, 92), 1.2, False, (0, 0), marks=pytest.mark.slow),
+        ((84, 92), 1.2, False, (0, 0)),
     ],
 )
 def test_a_large_bubble_of_the_first_frames_is_no_background(shape, ratio, upright, off):

@@ -64,6 +64,7 @@ def test_a_needle_that_stands_there_throughout_is_no_bubble(towards, gap, width,
     assert "what stands still about" in note
 
 
+@pytest.mark.slow
 def test_electrodes_and_a_needle_of_a_dark_field():
     both = needle(0, 8, 9) + needle(180, 9, 9)
     for shown in (filmed(both), filmed(needle(-90, 9, 12), bright=True)):

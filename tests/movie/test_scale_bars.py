@@ -32,7 +32,9 @@ def barred(empty=0, drift=(0.0, 0.0), texture=0.0, seed=1):
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("empty", "drift", "texture"), [(0, (0.0, 0.0), 0.0), (5, (0.25, 0.4), 0.02)])
+@pytest.mark.parametrize(
+    ("empty", "drift", "texture"), [(0, (0.0, 0.0), 0.0), pytest.param(5, (0.25, 0.4), 0.02, marks=pytest.mark.slow)]
+)
 def test_a_bubble_beside_a_scale_bar_is_read(empty, drift, texture, seed):
     movie = movie_of(barred(empty, drift, texture, seed))
     result = track(movie)

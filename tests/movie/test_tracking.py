@@ -14,6 +14,7 @@ from en4dvar_movie.choice import Correction
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import track
 
+KINDS = [kind for kind in CLASSES if kind != "ellipse"]
 RADII = np.array([12.3, 20.0, 31.7, 40.2, 25.5, 9.1])
 
 
@@ -21,7 +22,7 @@ def frames(scene=Scene(), radii=RADII, seed=1):  # noqa: B008  # a frozen value
     return list(render(radii[:, None], scene, np.random.default_rng(seed)))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in CLASSES if kind != "ellipse"])
+@pytest.mark.parametrize("kind", [*KINDS[:4], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[4:])])
 def test_radii_of_every_class_of_frame_are_the_true_ones(kind):
     scores, wrong = rendered(kind, 4)
     assert np.isfinite(wrong).mean() == 1

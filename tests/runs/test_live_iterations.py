@@ -58,7 +58,9 @@ def iterations(lines, name):
     return [int(found[1]) for line in lines if (found := re.search(rf" {name}: iteration +(\d+)  J ", line))]
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["threads", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("processes", "dask"))]
+)
 def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypatch, kind):
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
     path, out = make_campaign(tmp_path, 3, "execution_models:WaitsTwice"), tmp_path / "run"
