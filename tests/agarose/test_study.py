@@ -26,8 +26,6 @@ from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 
-pytestmark = pytest.mark.xdist_group("study")  # of which a run takes minutes: by one worker, not by each
-
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GELS = ("0.3 %", "1 %")
 
@@ -58,6 +56,7 @@ def small(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_every_table_and_figure_is_there(small):
     out, told, _ = small
     for number in (1, 2):
@@ -73,6 +72,7 @@ def test_every_table_and_figure_is_there(small):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_synthetic_is_said_wherever_numbers_appear(small):
     out, told, _ = small
     assert "synthetic twin" in told
@@ -87,6 +87,7 @@ def test_synthetic_is_said_wherever_numbers_appear(small):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_tables_hold_the_printed_values(small):
     out, _, _ = small
     lines = [line.split(",") for line in (out / "table1.csv").read_text().splitlines() if not line.startswith("#")]
@@ -100,12 +101,14 @@ def test_tables_hold_the_printed_values(small):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_earlier_study_is_kept(small):
     _, _, call = small
     assert isinstance(CliRunner().invoke(study_command, call).exception, OutputError)
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_changed_study_is_not_continued(small):
     out, _, call = small
     before = sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*"))
@@ -117,6 +120,7 @@ def test_a_changed_study_is_not_continued(small):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_file_of_the_user_is_not_taken_for_one_of_the_study(small, tmp_path, monkeypatch):
     """It would be removed by the next ``--force``. Two figures are drawn again; more would be claimed alike."""
     monkeypatch.setattr(report, "all_figures", lambda study: islice(all_figures(study), 2))
@@ -196,6 +200,7 @@ def _files(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_results_as_netcdf(small):
     out, _, _ = small
     with xr.open_datatree(out / "study.nc") as tree:
@@ -274,6 +279,7 @@ def twin(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("route", ["sweep", "en4dvar"])
 def test_qualitative_findings(twin, route):
     for gel, least in zip(GELS, (10.0, 2.5), strict=True):
@@ -290,6 +296,7 @@ def test_qualitative_findings(twin, route):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_90_percent_intervals_cover_the_twin(twin):
     sizes = [len(twin.fits[gel]["qlkv"].problems) for gel in GELS]
     for q in QUANTITIES:
@@ -298,6 +305,7 @@ def test_90_percent_intervals_cover_the_twin(twin):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_most_bubbles_are_undecidable(twin):
     for gel in GELS:
         assert twin.comparisons[gel].undecidable >= 0.7 * len(twin.comparisons[gel].single)
@@ -305,6 +313,7 @@ def test_most_bubbles_are_undecidable(twin):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_R0_stays_at_its_initial_guess_where_the_prior_is_as_narrow_as_the_papers_spread(twin):
     """Table 2 prints R0 = 0.51 ± 0.06 and 1.29 ± 0.05 µm: a prior as narrow gives this, and the DFS tells why."""
     for gel in GELS:

@@ -19,4 +19,4 @@ def test_each_test_is_of_one_part(of, now):
 def test_a_part_is_run_in_turn_or_all(request):
     ci = (request.config.rootpath / ".ci" / "run").read_text()
     assert "\nturn=$(($(date +%s) / 10800))\n" in ci
-    assert '[ "$asked" = all ] || slow+=(--turn "$turn")\npytest -n auto --dist loadgroup "${slow[@]}"' in ci
+    assert '[ "$asked" = all ] || slow+=(--turn "$turn")\npytest -n auto "${slow[@]}"' in ci
