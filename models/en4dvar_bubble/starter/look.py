@@ -58,10 +58,8 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
         excursion = lobe(times, radius)
         late, estimates = LATE * excursion.t_c, list(_estimates(times, radius, scatter, excursion))
     if not estimates:  # a few readings between which anything may lie, or a history that begins behind the top
-        time_std = np.fmax(np.median(np.diff(times)), late)
-        return Top(
-            float(times[reading]), float(radius[reading]), float(time_std), 0.03 * float(radius[reading]), reading
-        )
+        height, time_std = float(radius[reading]), float(np.fmax(np.median(np.diff(times)), late))
+        return Top(float(times[reading]), height, time_std, 0.03 * height, reading)
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     chosen = estimates[0]
     for value, std in estimates:
