@@ -62,7 +62,6 @@ from en4dvar.diagnosis.withheld import BAND, expectations, quantile
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.state import Array
 from en4dvar.problem import InverseProblem
-from en4dvar.report.history import withheld_lines
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
 from en4dvar_bubble.model import BubbleModel
@@ -253,13 +252,15 @@ def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
 
 def _next(result: Result, largest: float) -> tuple[int, float, float] | None:
     """How many readings follow the window to the next minimum, their share in the 90 % bands, and rms over R_max."""
-    lines, within = withheld_lines(result), shown(result.group("observed_data")["radius"])
-    count = to_the_next_minimum(within, np.array([float(str(line[4])) for line in lines]))
+    if "/withheld" not in result.groups:
+        return None
+    held, within = result.group("withheld"), shown(result.group("observed_data")["radius"])
+    readings, low, median, high = (shown(held[f"radius{part}"]) for part in ("", "_low", "_median", "_high"))
+    count = to_the_next_minimum(within, readings)
     if not count:
         return None
-    off = np.array([float(str(line[4])) - float(str(line[6])) for line in lines[:count]])
-    share = float(np.mean([line[-1] == 1 for line in lines[:count]]))
-    return count, share, float(np.sqrt(np.mean(off**2))) * 1e-6 / largest  # readings are in µm
+    share = float(np.mean(((low <= readings) & (readings <= high))[:count]))
+    return count, share, float(np.sqrt(np.mean((readings - median)[:count] ** 2))) * 1e-6 / largest  # they are in µm
 
 
 def chances(problem: InverseProblem, result: Result, parts: dict[str, int]) -> dict[str, list[float]]:
