@@ -3,10 +3,12 @@ r"""A proposal that is the emulated posterior itself, for posteriors that are to
     x_i ~ exp(−Ĵ/τ),   w_i = exp(Ĵ(x_i)/τ − J(x_i)),   ∫ exp(−J) dx = ∫ exp(−Ĵ/τ) dx · E[w]
 
 Where ten parameters are tied together to some thousandths of their spread, a mixture fitted to a few hundred draws
-keeps 2 to 5 % of its draws effective and loses the tails. Predictions bend far less than J does, and J of quadratic
+keeps 2 to 5 % of its draws effective and loses the tails. Predictions bend far less than J does, and J of polynomial
 predictions costs microseconds: of it tens of thousands of draws can be made, which show the whole of that valley, and
 10 to 60 % of them stay effective under the model. The emulator is fitted to all runs made so far, and learns where it
-is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyond the runs before them.
+is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyond the runs before them. The more runs
+there are, the higher is the degree of its polynomials: with quadratic ones a valley that turns by a right angle, as of
+a stiffness and a stiffening that stand for each other, lost a third of its probability.
 
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
@@ -31,12 +33,13 @@ WALKERS, MOVES = 600, 20  # they are drawn by their weights, and move about wher
 RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
 FIRST_TURNS, TURNS = 10, 3  # both so often
 HALF = 0.5  # of the walkers stay effective from a density to the next
+HIGHEST = 8  # degree of polynomials, where runs are many
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
 class RecordedRuns:
     """J (B,) of control vectors (B, n) by the model, +inf where that fails; what the runs gave is kept. An emulator of
-    many runs has polynomials up to degree ``highest``, if that is more than few runs allow.
+    many runs has polynomials up to degree :data:`HIGHEST`.
     """
 
     def __init__(
@@ -45,10 +48,9 @@ class RecordedRuns:
         costs: Callable[[Array, Forecast], Array],
         prior: Prior,
         observations: Observations,
-        highest: int = 0,
     ):
         self._run, self._costs, self.prior, self.observations = run, costs, prior, observations
-        self._wanted, self._highest = needed_runs(len(prior.names)), highest
+        self._wanted = needed_runs(len(prior.names))
         self.runs: ModelRuns | None = None
 
     def __call__(self, x: Array) -> Array:
@@ -71,7 +73,7 @@ class RecordedRuns:
         (degree, fewest), n = self._wanted, len(self.prior.names)
         near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR * n * heat))
         chosen = np.argsort(self.runs.costs, kind="stable")[: max(fewest, near)]
-        while degree < self._highest and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
+        while degree < HIGHEST and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
             degree += 1
         return fitted_cost(self.prior, self.observations, degree, self.runs[chosen], n * heat)
 

@@ -11,6 +11,7 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.sampling import emulated_draws
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
 from en4dvar.sampling.modes import HEATS, LAST_HEAT, TOO_FEW, sample_modes
 
@@ -130,6 +131,7 @@ def test_an_emulator_that_is_far_behind_the_mixture_is_given_up(monkeypatch):
         return made(*arguments)
 
     monkeypatch.setattr(EmulatedProposal, "fitted", counted)
+    monkeypatch.setattr(emulated_draws, "HIGHEST", 2)  # of higher ones, noise is no longer far behind
     draws = sample_modes(flipping.recorded, flipping.prior, [Valley().about], 1, 400.0)
     assert fitted == [*HEATS, LAST_HEAT]
     assert draws.effective > TOO_FEW
@@ -166,6 +168,21 @@ def test_where_the_model_cannot_be_run_nothing_is_drawn():
     density = np.exp(logs - logs.max())
     expected = np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0)
     assert weighted_quantiles(draws) == pytest.approx(expected, abs=0.25)
+
+
+def test_an_emulator_of_many_runs_bends_as_far_as_they_do():
+    """J along the whole valley, by quadratic predictions, which are all that 200 runs allow, and by quartic ones."""
+    valley, stream, off = Valley(), np.random.default_rng(3), []
+    z = stream.standard_normal((3200, N))
+    z[:, 0] = stream.uniform(-2.5, 2.5, len(z))
+    z[:, 1:5] = valley.observations.values - bent(z[:, 0]) + WIDTH * z[:, 1:5]
+    fresh, expected = z[3000:], valley.costs(z[3000:], valley.run(z[3000:]))
+    for count in (200, 3000):
+        recorded = valley.recorded
+        recorded(z[:count])
+        off.append(np.quantile(np.abs(recorded.emulated(8.0).cost(fresh) - expected), 0.9))
+    assert off[0] > 0.3
+    assert off[1] < 0.02
 
 
 def test_a_draw_below_what_is_looked_for_ends_them_all():

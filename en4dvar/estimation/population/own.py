@@ -52,7 +52,6 @@ NARROWEST = 0.03  # standard deviation of the first draws about members, in unit
 KEPT = 4000  # equally likely draws of each data set
 HEAT, JUDGING = 1.5, 400  # of fresh draws of the emulated posterior, and the number of these, of which such a share
 TRUSTED = 0.98  # must stay effective under J, for others of its draws to be taken without a run
-HIGHEST = 8  # degree of an emulator's polynomials, where runs are many
 PARTS, ROUNDS = 4, 200  # components of each mixture; rounds of expectation maximisation, of which four need more
 MANY = 2500.0  # effective draws from which the components are twice as many
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
@@ -218,7 +217,7 @@ def own_draws(
     x = prior.from_white(start)
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
-    runs = RecordedRuns(composite, partial(costs, problem), prior, observations, HIGHEST)
+    runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
     draws, stream = sample_modes(runs, prior, [about], seed, enough), member_stream(seed, "population: kept draws")
     z = prior.white(draws.x[resampled(draws.shares, KEPT, stream)])
     emulated = emulate and _emulated(runs, z, stream)
