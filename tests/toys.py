@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from curves import OBSERVABLE as OBSERVABLE
 from curves import Closed as Closed
 from curves import Counted as Counted
@@ -49,6 +50,26 @@ def cosines_estimated(n, y, std, seed):
         seed=seed,
         progress=False,
     )
+
+
+def cost_by_definition(problem, x):
+    """J_b and J_o (B,) of parameters (B, n), written out for normal priors and independent errors of known std."""
+    o, (mean, std) = problem.observations, np.array([(term.mean, term.std) for term in problem.prior.terms]).T
+    curve = problem.model.curve
+    if problem.model.of_arrays:
+        predictions = curve(x.T[..., None], o.times)
+    else:
+        predictions = np.array([[curve(row, t) for t in o.times] for row in x])
+    misfits = (o.values - predictions) / o.std
+    return 0.5 * np.sum(((x - mean) / std) ** 2, axis=1), 0.5 * np.sum(o.weights * misfits**2, axis=1)
+
+
+def assert_cost_by_definition(analysis):
+    """J_b and J_o where the iterations ended are those of :func:`cost_by_definition`."""
+    last = analysis.iterations[-1]
+    background, observation = cost_by_definition(analysis.problem, last.centre[None])
+    assert last.background == pytest.approx(background[0], rel=1e-9)
+    assert last.observation == pytest.approx(observation[0], rel=1e-9)
 
 
 def with_noise(observations, **kind):

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from toys import Closed, make_observations, make_problem
+from toys import Closed, cost_by_definition, make_observations, make_problem
 
-from en4dvar.estimation.assimilate import log_posterior
 from en4dvar.priors.prior import PriorTerm
 
 
@@ -93,10 +92,13 @@ def parted(kind=Parting, mean=0.3, seed=1, off=0.0, **options):
     return replace(problem, observations=replace(y, continued=whole))
 
 
-def mass_of_positive(problem):
-    """Of a > 0, and J at its minimum on either side, on a grid."""
-    axes = [m + s * np.linspace(-5, 5, 161) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
+def mass_and_evidence(problem):
+    """Of a > 0, and ln p(y), on a grid."""
+    (a, b), o = problem.prior.terms, problem.observations
+    axes = [term.mean + term.std * np.linspace(-5, 5, 161) for term in (a, b)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    logs = log_posterior(problem, grid)
+    logs = -sum(cost_by_definition(problem, grid))
     p = np.exp(logs - logs.max())
-    return p[grid[:, 0] > 0].sum() / p.sum()
+    cell = (10 / 160) ** 2 / (2 * np.pi)  # in prior standard deviations, beside their norm
+    evidence = logs.max() + np.log(p.sum() * cell) - np.sum(np.log(o.std * np.sqrt(2 * np.pi)))
+    return p[grid[:, 0] > 0].sum() / p.sum(), float(evidence)

@@ -16,7 +16,7 @@ Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319; 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,8 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import with_errors
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
 from en4dvar.model.state import Array, Mask
-from en4dvar.priors.prior import member_stream
+from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.problem import InverseProblem
 
 DRAWS, FREEDOM = 250, 5.0  # of Student's t, and as many of the prior, for each parameter of the errors
 WIDER = 1.3  # than the Gaussian at the mode
@@ -52,6 +53,7 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     (n,), all transformed. None where no such parameter is estimated, or members are too few for all coordinates.
     """
     problem, prior = space.problem, space.problem.prior
+    prior = replace(prior, blocks=tuple(block.with_first(problem.of_errors) for block in prior.blocks))
     of_errors = np.array([name in problem.of_errors for name in prior.names])
     if not of_errors.any() or space.basis.shape[1] < len(mode):
         return None
@@ -61,7 +63,7 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
     root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
     about, half = prior.white(mode)[of_errors], DRAWS * count
-    linearised = _Linear.of(space, linear, mode, of_errors)
+    linearised = _Linear.of(space, linear, prior, prior.white(mode), of_errors)
     for _ in range(ROUNDS):
         # evenly along each coordinate (McKay, Beckman & Conover 1979, Technometrics 21, 239)
         ranks = stream.permuted(np.tile(np.arange(half), (2 * count + 1, 1)), axis=1)
@@ -106,29 +108,30 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
 
 @dataclass(frozen=True)
 class _Linear:
-    """J with predictions linear about a mode: ``slopes`` (n', K) of u, which lies at ``rest`` (n',) there; white
-    coordinates.
+    """J with predictions linear about a ``mode`` (n,), with ``slopes`` (n, K), in white coordinates of a ``prior`` of
+    which those of h do not depend on u. Where parameters of u are correlated with those of h, predictions depend on h.
     """
 
-    space: WeightSpace
+    problem: InverseProblem
+    prior: Prior
     at: Predicted
     of_errors: Mask
     slopes: Array
-    rest: Array
+    mode: Array
 
     @classmethod
-    def of(cls, space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask) -> "_Linear":
-        prior = space.problem.prior
+    def of(cls, space: WeightSpace, linear: Linearisation, prior: Prior, mode: Array, of_errors: Mask) -> "_Linear":
         to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
-        slopes = (np.linalg.pinv(to_control).T @ linear.anomalies)[~of_errors]
-        return cls(space, linear.prediction, of_errors, slopes, prior.white(mode)[~of_errors])
+        slopes = np.linalg.pinv(to_control).T @ linear.anomalies
+        if not any(space.problem.of_errors.intersection(block.names) for block in prior.blocks):
+            slopes[of_errors] = 0.0  # but for the error of differences
+        return cls(space.problem, prior, linear.prediction, of_errors, slopes, mode)
 
     def cost(self, x: Array) -> Array:
         """J (B,) of control vectors (B, n)."""
-        z = self.space.problem.prior.white(x)
-        values = self.at.values + (z[:, ~self.of_errors] - self.rest) @ self.slopes
-        predicted = self._predicted(z[:, self.of_errors], values)
-        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.problem.observations.cost(predicted))
+        z = self.prior.white(x)
+        predicted = self._predicted(z[:, self.of_errors], self.at.values + (z - self.mode) @ self.slopes)
+        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.problem.observations.cost(predicted))
 
     def moments(self, draws: Array) -> tuple[Array, Array, Array, Array]:
         """ln p(y|h) (D,) but for the errors' normalisation, −inf where it is not known, of u the mean (D, n') and
@@ -139,14 +142,21 @@ class _Linear:
         return log, mean, root, size
 
     def _moments(self, draws: Array) -> tuple[Array, Array, Array, Array]:
-        observations, rest = self.space.problem.observations, self.rest
-        predicted = self._predicted(draws, np.tile(self.at.values, (len(draws), 1)))
+        observations, rest, apart = (
+            self.problem.observations,
+            self.mode[~self.of_errors],
+            draws - self.mode[self.of_errors],
+        )
+        of_h, of_u = self.slopes[self.of_errors], self.slopes[~self.of_errors]
+        predicted = self._predicted(draws, self.at.values + apart @ of_h)
         log = -observations.cost(predicted) - 0.5 * rest @ rest
         possible = np.isfinite(log)
-        rows = np.vstack([self.slopes, observations.values - self.at.values])
+        rows = np.vstack([of_u, observations.values - self.at.values, of_h])
         # Least squares in u − rest: readings, then the prior, the right-hand side last
-        readings = np.zeros((len(draws), len(self.at.values), len(rows)))
-        readings[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
+        white = np.zeros((len(draws), len(self.at.values), len(rows)))
+        white[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
+        readings, moved = np.split(white, [len(of_u) + 1], axis=2)
+        readings[:, :, -1] -= np.einsum("dkh,dh->dk", moved, apart)
         prior = np.tile(np.column_stack([np.eye(len(rest)), -rest]), (len(draws), 1, 1))
         triangle = np.asarray(np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r"))
         root, side = np.linalg.inv(triangle[:, :-1, :-1]), triangle[:, :-1, -1]
@@ -156,12 +166,11 @@ class _Linear:
 
     def _predicted(self, draws: Array, values: Array) -> Predicted:
         """Predictions ``values`` (D, K) beside draws of h (D, n'')."""
-        problem, prior, count = self.space.problem, self.space.problem.prior, len(draws)
-        z = np.zeros((count, len(prior.names)))
+        z = np.zeros((len(draws), len(self.mode)))
         z[:, self.of_errors] = draws
-        physical = prior.to_physical(prior.from_white(z))
-        rates = None if self.at.rates is None else np.tile(self.at.rates, (count, 1))
-        return with_errors(problem, physical, values, rates)
+        physical = self.prior.to_physical(self.prior.from_white(z))
+        rates = None if self.at.rates is None else np.tile(self.at.rates, (len(draws), 1))
+        return with_errors(self.problem, physical, values, rates)
 
 
 def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Drawn | None:

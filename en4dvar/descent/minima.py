@@ -50,8 +50,11 @@ class Minimum:
 
     @cached_property
     def _precision(self) -> Array:
-        """(n, n); that of the directions that the covariance has, where some are lost to rounding."""
-        return np.asarray(np.linalg.pinv(self.covariance, rcond=np.finfo(float).eps * len(self.x), hermitian=True))
+        """(n, n), in any units; that of the directions that the covariance has, where some are lost to rounding."""
+        std = np.sqrt(np.diag(self.covariance))
+        sizes = np.outer(std, std) + np.finfo(float).tiny
+        rounding = np.finfo(float).eps * len(self.x)
+        return np.asarray(np.linalg.pinv(self.covariance / sizes, rcond=rounding, hermitian=True) / sizes)
 
     def log_evidence(self, prior: Prior) -> float:
         """Laplace's approximation of ln ∫ exp(−J_o) N(x; prior) dx over this minimum alone."""

@@ -9,8 +9,8 @@ Where J of the whole window has too many minima, windows are lengthened step by 
 minima as its trajectories part within the window. J of its beginning has one, and the minimum of a window lies near
 that of the window a little shorter: each descent starts where the one before it ended (quasi-static variational
 assimilation: Pires, Vautard & Talagrand 1996, Tellus A 48, 96; Swanson, Vautard & Pires 1998, Tellus A 50, 369).
-Readings after the end of a window have the weight zero, and correlated errors count as independent on the way there,
-where windows only lead on; the whole window has R as it is.
+Readings after the end of a window have the weight zero, and on the way there, where windows only lead on, correlated
+errors count as independent and a discrepancy as nothing; the whole window has R as it is.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -83,7 +83,7 @@ def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
     """
     observations, scheme = space.problem.observations, space.minimiser
     noise = observations.noise
-    if not noise.independent and not space.problem.discrepancy:
+    if not noise.independent:
         noise = noise_of(noise.std, noise.time_std)
     own = replace(scheme, lengthen=1, cost_tolerance=max(ROUGH, scheme.cost_tolerance))
     settings = replace(space.settings, own=own)

@@ -9,7 +9,7 @@ import numpy as np
 from en4dvar.descent.step_control import Trials
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast, costs
-from en4dvar.ensemble.linalg import FEW, Hessian, LowRank, anomaly_basis, centre
+from en4dvar.ensemble.linalg import FEW, Hessian, LowRank, anomaly_basis, centre, least_coordinates
 from en4dvar.ensemble.missing import filled
 from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
@@ -74,11 +74,7 @@ class WeightSpace:
 
     def weights_of(self, x: Array) -> Array:
         """The shortest weights (…, N) of control vectors (…, n) that the anomalies reach."""
-        return self._shortest(self.anomalies, x)
-
-    def _shortest(self, anomalies: Array, x: Array) -> Array:
-        scale = np.sqrt(self.prior_variance)
-        return np.asarray(np.linalg.lstsq((anomalies / scale).T, ((x - self.mean) / scale).T, rcond=None)[0].T)
+        return least_coordinates(self.anomalies, x - self.mean)
 
     def ensemble(self, w: Array, transform: Array | LowRank) -> Array:
         """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""
@@ -129,7 +125,8 @@ class WeightSpace:
 
     def with_sampled_prior(self, x: Array, costs: Array) -> Array:
         """J (B,) of control vectors (B, n) with the prior's mean and covariance of the members, from ``costs``."""
-        coordinates = self._shortest(self.basis.T @ self.anomalies, x)  # weights of all x are a square of the members
+        along = self.basis.T @ self.anomalies  # weights of all x would be a square of the members
+        coordinates = least_coordinates(along, x - self.mean)
         return costs - self.problem.prior.cost(x) + diag.background_cost(coordinates, len(self.members))
 
     def try_out(self, w: Array, expected: Callable[[Array], Array] | None = None) -> Trials:

@@ -54,6 +54,17 @@ def min_norm_fit(design: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0])
 
 
+def least_coordinates(directions: Array, changes: Array) -> Array:
+    """The shortest coordinates (…, r) of ``changes`` (…, n), which are these times the ``directions`` (r, n).
+
+    Columns are scaled first, so units do not matter: with a pressure in Pa beside a time in s, all but the pressure
+    would be taken for rounding.
+    """
+    scale = np.sqrt(np.mean(directions**2, axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    return min_norm_fit((directions / scale).T, (changes / scale).T).T
+
+
 def bundle_steps(spread: Array, axes: Array, epsilon: float) -> Array:
     """Steps of a bundle as rows (r, r), in units of ε prior standard deviations.
 

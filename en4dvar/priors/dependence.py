@@ -6,7 +6,7 @@ C is the correlation of the values of ``normal`` parameters, of the logarithms o
 Gaussian scores of the others (a Gaussian copula): each parameter has the prior that is stated for it alone.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -86,6 +86,14 @@ class Dependence:
         """L⁻¹ y of standardised coordinates (…, m)."""
         flat = y.reshape(-1, y.shape[-1]).T
         return np.asarray(solve_triangular(self.root, flat, lower=True).T.reshape(y.shape))
+
+    def with_first(self, names: Collection[str]) -> "Dependence":
+        """The same with those of its parameters that are in ``names`` before the others: their white coordinates then
+        are functions of themselves alone.
+        """
+        order = sorted(range(len(self.names)), key=lambda i: self.names[i] not in names)
+        members = None if self.members is None else self.members[:, order]
+        return Dependence(tuple(self.names[i] for i in order), self.matrix[np.ix_(order, order)], members)
 
     def among(self, names: Sequence[str]) -> "Dependence | None":
         """The block of those of its parameters that are in ``names``; None where fewer than two are left."""

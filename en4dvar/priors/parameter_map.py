@@ -145,12 +145,11 @@ def score(kind: str, theta: Array, bounds: Bounds, shape: Numbers) -> Array:
 
 
 def slope(kind: str, x: float, bounds: Bounds, shape: Numbers) -> float:
-    """dθ/dx = φ(x)/f(θ)."""
-    (low, high), scale = bounds, _scale(bounds, shape)
-    theta = float(value(kind, np.array(x), bounds, shape))
-    u, rest = (theta - low) / scale, (high - theta) / scale
-    log_density = QUANTILE_MAPS[kind].log_density(u, rest, shape)
-    return scale * math.exp(-LOG_ROOT_2PI - 0.5 * x * x - log_density)
+    """dθ/dx = φ(x)/f(θ), also where θ is rounded to a bound."""
+    quantiles, from_low = QUANTILE_MAPS[kind], x < 0 or math.isinf(bounds[1])
+    near = max(float((quantiles.below if x < 0 else quantiles.above)(np.array(x), shape)), np.finfo(float).tiny)
+    u, rest = (near, 1 - near) if from_low else (1 - near, near)
+    return _scale(bounds, shape) * math.exp(-LOG_ROOT_2PI - 0.5 * x * x - quantiles.log_density(u, rest, shape))
 
 
 def _scale(bounds: Bounds, shape: Numbers) -> float:

@@ -22,7 +22,9 @@ def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covarian
     quantiles nearer to those of all. Where too few differ, the chosen ones.
     """
     n = x.shape[1]
-    if len(chosen) <= n or np.linalg.matrix_rank(x[chosen] - x[chosen].mean(axis=0)) < n:
+    apart = x[chosen] - x[chosen].mean(axis=0)
+    largest = np.abs(apart).max(axis=0) + np.finfo(float).tiny  # units do not matter
+    if len(chosen) <= n or np.linalg.matrix_rank(apart / largest) < n:
         return np.asarray(x[chosen])
     z = np.linalg.solve(np.linalg.cholesky(np.atleast_2d(covariance)), (x - mean).T).T
     upper = np.triu_indices(n)

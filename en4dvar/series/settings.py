@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from en4dvar import schemes
-from en4dvar.ensemble.linalg import centre, min_norm_fit
+from en4dvar.ensemble.linalg import centre, least_coordinates
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.localisation import BlockLocalisation
@@ -88,7 +88,7 @@ class EnRTS:
                 smoothed = narrowed(following, widened, narrowed(analysis, inflated, smoothed))
             _, anomalies = centre(following)
             # (E − F) X⁺ (N, N) rather than J (n, n), for states of any size
-            weights = min_norm_fit(anomalies.T, (smoothed - following).T).T
+            weights = least_coordinates(anomalies, smoothed - following)
             analysis = trail[k][-1]
             smoothed = analysis + weights @ centre(analysis)[1]
             put(k, smoothed)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from chaotic import chaotic
 from cut_anywhere import assert_cut_anywhere
-from toys import Linear, make_problem, with_noise
+from toys import Linear, make_problem, with_discrepancy, with_noise
 
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import ConfigError
@@ -46,6 +46,12 @@ def test_a_linear_problem_ends_where_it_does_without(correlated):
     with_and_without = [assimilate(problem, AssimilationSettings(lengthen=n), seed=2) for n in (1, 4)]
     np.testing.assert_allclose(*(a.posterior for a in with_and_without), rtol=1e-9)
     assert with_and_without[1].forward_runs > with_and_without[0].forward_runs - 60
+
+
+def test_a_discrepancy_waits_for_the_whole_window():
+    problem = with_discrepancy(make_problem(Linear(("a", "b")), [1.0, -0.5]))
+    with_and_without = [assimilate(problem, AssimilationSettings(lengthen=n), seed=2) for n in (1, 4)]
+    np.testing.assert_allclose(*(a.centre for a in with_and_without), rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Closed, Decay, Toy, Wave, make_problem, visit
+from toys import Closed, Decay, Toy, Wave, assert_cost_by_definition, make_problem, visit
 
 from en4dvar.descent.step_control import LONGEST, Point, Tangent, Trials, acceleration, line_search, run_searches
 from en4dvar.descent.weight_space import WeightSpace
@@ -95,6 +95,7 @@ def test_bent_steps_follow_a_curved_valley():
     settings = AssimilationSettings(members=12, starts=1, start="prior-mean")
     line = assimilate(problem, settings, 1)
     assert line.converged
+    assert_cost_by_definition(line)
     straight = assimilate(problem, replace(settings, step_control="levenberg-marquardt"), 1)
     assert line.iterations[-1].cost <= straight.iterations[-1].cost + 1e-3
     assert len(line.iterations) < len(straight.iterations)
@@ -167,10 +168,11 @@ def test_three_starts_find_the_lowest_of_many_minima(seed):
     """Prior so wide that b sin(3 b t) has many minima; twenty starts from another ensemble are the reference."""
     problem = make_problem(Wave(), [1.5, 3.0], scale=2.5, seed=seed)
     reference = assimilate(problem, AssimilationSettings(members=60, starts=20), 99).iterations[-1].cost
-    ends = {
-        starts: assimilate(problem, AssimilationSettings(members=24, starts=starts), seed).iterations[-1].cost
-        for starts in (1, 3)
-    }
+    ends = {}
+    for starts in (1, 3):
+        found = assimilate(problem, AssimilationSettings(members=24, starts=starts), seed)
+        assert_cost_by_definition(found)
+        ends[starts] = found.iterations[-1].cost
     assert ends[3] < reference + 0.01
     if seed == 1:
         assert ends[1] > reference + 1  # the member of lowest J lies in the wrong basin

@@ -5,7 +5,7 @@ import pytest
 from cut_anywhere import assert_cut_anywhere
 from toys import Counted, Decay, Wave, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
-from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_of_positive, parted, two_wells
+from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_and_evidence, parted, two_wells
 
 from en4dvar.descent import minima, search
 from en4dvar.descent.minima import Minimum
@@ -217,7 +217,7 @@ def test_from_a_draw_below_all_minima_another_descent_starts(monkeypatch):
     assert analysis.centre[0] == pytest.approx(
         analysis.modes[0].centre[0], rel=0.02
     )  # minimum, and median of its draws
-    assert analysis.modes[0].weight == pytest.approx(mass_of_positive(problem), abs=0.03)
+    assert analysis.modes[0].weight == pytest.approx(mass_and_evidence(problem)[0], abs=0.03)
     assert "starts-disagree" not in {c.code for c in analysis.cautions}
     assert [record.further for record in heard if isinstance(record, StartRecord)] == [1]
     assert [record for record in heard if isinstance(record, Descents)][-1] == told
@@ -323,7 +323,7 @@ def test_readings_after_the_window_lead_to_a_minimum_that_was_missed(kind, monke
         assert sorted(round(float(mode.centre[0])) for mode in analysis.modes) == [-1, 1 if kind is Parting else 0]
         assert analysis.withheld.inside > 0.6
         right = sum(mode.weight for mode in analysis.modes if mode.centre[0] > 0)
-        assert right == pytest.approx(mass_of_positive(problem), abs=0.06)
+        assert right == pytest.approx(mass_and_evidence(problem)[0], abs=0.06)
         assert "future-missed" not in {c.code for c in analysis.cautions}
     monkeypatch.setattr(Search, "foretold", lambda self, outcome, expected: outcome)
     lost = assimilate(problem, settings, seed)

@@ -8,6 +8,7 @@ import pytest
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.descent.step_control import LEAST, Settling
+from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
@@ -71,6 +72,20 @@ def prey_problem(seed: int, log_std: float = 0.4) -> InverseProblem:
     return InverseProblem(model, model.observables[0], observations, Prior(terms))
 
 
+def assert_by_definition(found: Analysis, spread: bool) -> None:
+    """J where it ended, written out; where ``spread``, the members' is that of (I/s² + HᵀH)⁻¹, H by differences."""
+    problem, last, step = found.problem, found.iterations[-1], 1e-4
+    x, median, log_std = np.log(last.centre), np.log([*RATES.values()]), problem.prior.std
+    beside = np.exp(x + step * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)]))
+    paths = problem.model.trajectories(np.array([[*START, *row] for row in beside]), problem.observations.times)
+    at, ahead, behind = np.split(np.array([path.states[:, 0] for path in paths]), [1, 5])
+    assert last.background == pytest.approx(0.5 * np.sum(((x - median) / log_std) ** 2), rel=1e-9)
+    assert last.observation == pytest.approx(0.5 * np.sum((problem.observations.values - at[0]) ** 2), rel=1e-9)
+    H = (ahead - behind) / (2 * step)
+    std = np.sqrt(np.diag(np.linalg.inv(np.diag(log_std**-2.0) + H @ H.T)))
+    assert not spread or np.log(found.posterior).std(axis=0, ddof=1) == pytest.approx(std, rel=0.05)
+
+
 def compare(seed: int) -> tuple[float, float]:
     """How far the means of both linearisations are apart, and their spreads, in posterior standard deviations."""
     ends = []
@@ -79,6 +94,7 @@ def compare(seed: int) -> tuple[float, float]:
         found = assimilate(prey_problem(seed), settings, seed)
         assert found.converged, found.stop_reason
         assert found.iterations[-1].step_norm <= settings.step_tolerance or linearisation == "bundle"
+        assert_by_definition(found, spread=linearisation == "bundle")
         ends.append(np.log(found.posterior))
     std = ends[1].std(axis=0)
     apart = np.abs(ends[0].mean(axis=0) - ends[1].mean(axis=0)) / std

@@ -40,9 +40,14 @@ def test_more_shared_quantities_than_draws_are_drawn_about_the_minimum(monkeypat
     singles = [Single(np.zeros(101), np.eye(101)) for _ in data]
     settings = AssimilationSettings(what_if=False, emulator="off", members=110)
     told = list[str]()
-    shared = estimate_jointly(joint, settings, 3, singles=singles, tell=told.append).shared
+    found = estimate_jointly(joint, settings, 3, singles=singles, tell=told.append)
     assert told[0].startswith("cost: members of 2 data sets are drawn by about 14000 forward runs, beside some ")
-    assert shared.std(axis=0).mean() == pytest.approx(1.0, abs=0.15)  # 12 readings leave most of 100 to the prior
+    assert found.shared.std(axis=0).mean() == pytest.approx(1.0, abs=0.15)  # 12 readings leave most of 100 to the prior
+    of_one = np.array([model.curve(row, times[:, None]) for row in np.eye(101)]).reshape(101, 6).T
+    design = np.hstack([np.tile(of_one[:, :100], (2, 1)), np.kron(np.eye(2), of_one[:, 100:])])
+    weighed = np.linalg.solve(0.3**2 * np.eye(12) + design @ design.T, readings.ravel())
+    np.testing.assert_allclose(found.shared_mode, design[:, :100].T @ weighed, rtol=0, atol=1e-9)
+    assert found.costs[-1] == pytest.approx(0.5 * readings.ravel() @ weighed, rel=1e-9)
 
 
 class Flat(Vectorised):
@@ -66,5 +71,7 @@ def test_a_lower_minimum_of_an_experiment_that_is_slow_to_reach_is_met(seed):
     experiments = [Experiment(joint, e, 1e-3, SerialExecutor()) for e in range(2)]
     descent = JointDescent(Place(np.zeros(1), (np.array([-5.0, 0, 0, 0, 0]),) * 2))
     JointObjective(joint, experiments, AssimilationSettings().own.minimiser).linearise([descent])
+    assert descent.at.cost == pytest.approx(25)  # J_b of −5 in both; their readings are met
+    assert experiments[0].costs(np.array([[0.3, 1.5, 0, 0, 0, 0]])) == pytest.approx(0.5 * (0.3**2 + 3.25**2) / 0.02**2)
     lower = members.challenger(experiments, descent.at, seed)
     np.testing.assert_allclose([own[0] for own in lower.own], 1.0, atol=0.05)

@@ -10,7 +10,7 @@ from toys import Vectorised, make_problem
 
 from en4dvar.config.dependence import term_of_members
 from en4dvar.estimation.assimilate import assimilate, log_posterior
-from en4dvar.model.state import Parameter
+from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -84,6 +84,37 @@ def minimum_of(problem):
 
     mean, expected, _ = closed_form(problem)
     return Minimum(mean, expected, float(-log_posterior(problem, mean[None])[0]))
+
+
+@pytest.mark.parametrize("first", ["a", "sigma"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_parameter_that_is_correlated_with_the_size_of_the_errors(first, seed):
+    """A level that is read five times: given ln σ it is Gaussian, before and after; over ln σ a sum."""
+    rho, k = 0.9, 5
+    problem = make_problem(Vectorised(("a",)), [1.0], seed=seed, k=k)
+    terms = {"a": problem.prior.terms[0], "sigma": PriorTerm.lognormal(NOISE_SCALE, 1.5, 0.8)}
+    names = (first, *terms.keys() - {first})
+    blocks = (Dependence(names, np.array([[1, rho], [rho, 1]])),)
+    problem = replace(problem, prior=Prior(tuple(terms[name] for name in names), blocks))
+    found = assimilate(problem, AssimilationSettings(refine="none"), seed)
+
+    z, y, term = np.linspace(-6, 6, 4001), problem.observations.values, terms["a"]
+    size, before = 0.1 * 1.5 * np.exp(0.8 * z), term.std**2 * (1 - rho**2)
+    apart = y - (term.mean + term.std * rho * z)[:, None]
+    after = 1 / (1 / before + k / size**2)
+    middle = term.mean + term.std * rho * z + after / size**2 * apart.sum(axis=1)
+    squares = np.sum(apart**2, axis=1) / size**2 - after * (apart.sum(axis=1) / size**2) ** 2
+    logs = -0.5 * (z**2 + squares + np.log(before / after)) - k * np.log(size) - 0.5 * (k + 1) * np.log(2 * np.pi)
+    evidence = np.logaddexp.reduce(logs) + np.log(z[1] - z[0])
+    weights = np.exp(logs - np.logaddexp.reduce(logs))
+    mean = weights @ middle
+    std = np.sqrt(weights @ (after + (middle - mean) ** 2))
+    members = found.posterior[:, names.index("a")]
+    assert found.log_evidence == pytest.approx(evidence, abs=0.1)
+    assert members.mean() == pytest.approx(mean, abs=0.1 * std)
+    assert members.std(ddof=1) == pytest.approx(std, rel=0.1)
+    scale = np.log(found.posterior[:, names.index("sigma")])
+    assert scale.mean() == pytest.approx(np.log(1.5) + 0.8 * weights @ z, abs=0.05)
 
 
 @pytest.mark.parametrize("method", ["exact", "random"])

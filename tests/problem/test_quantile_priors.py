@@ -61,6 +61,16 @@ def test_the_density_in_the_displayed_quantity(name):
         assert density == pytest.approx(float(named.pdf(float(term.to_physical(np.array(x))))), rel=1e-10)
 
 
+@pytest.mark.parametrize("x", [-4.0, -2.5, 0.7, 4.0])
+def test_the_slope_where_a_value_is_rounded_to_a_bound(x):
+    """Of a beta with much of its probability there: that of 1 + θ/8 is an eighth of that of θ, which has its digits."""
+    slopes = [PriorTerm.beta(A, bounds, 0.17, 1.2).slope(x) for bounds in ((0.0, 1.0), (1.0, 1.125))]
+    step = 1e-5 * np.array([-1.0, 1.0])
+    low, high = PriorTerm.beta(A, (0.0, 1.0), 0.17, 1.2).to_physical(x + step)
+    assert slopes[0] == pytest.approx((high - low) / 2e-5, rel=1e-4)
+    assert slopes[1] == pytest.approx(slopes[0] / 8, rel=1e-12)
+
+
 @pytest.mark.parametrize("name", NAMED)
 def test_moments_by_quadrature_and_of_draws(name):
     term, named = NAMED[name]

@@ -25,6 +25,7 @@ from en4dvar.data.noise import Linearisation, Predicted
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.influence import ReadingTangent
 from en4dvar.ensemble.forecast import Composite
+from en4dvar.ensemble.linalg import least_coordinates
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
 from en4dvar.model.state import Array
@@ -73,7 +74,7 @@ class LinearResponse:
 
     def coordinates(self, changes: Array) -> Array:
         """Coordinates (…, r) of changes (…, n) of the control vector, of least length."""
-        return np.asarray(np.linalg.lstsq(self.directions.T, changes.T, rcond=None)[0].T)
+        return least_coordinates(self.directions, changes)
 
     def step(
         self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
