@@ -192,7 +192,8 @@ def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
         "rebound": f"is {rest} its radius at rest (R_eq), and does its gas lose heat as the model's does (model.gas)?",
     }
     questions = [asked[name] for name in names if name in asked]
-    return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
+    free = " and ".join(p.name for p in model.law.parameters if p.name in WIDTHS)
+    return f"no {free} of {model.law.name} will give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
 def _implausible(look: Look, coated: bool) -> str:
