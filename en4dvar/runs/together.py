@@ -139,9 +139,10 @@ class TogetherKind(Kind, ABC):
 
     def within(self, work: Worklist, executor: Executor, group: SetGroup | None = None) -> None:
         """Of the data sets of a run (or of one ``group`` of them) that have a posterior, at its end; too few of them
-        are told. A file that a resumed run finds, made of the same, is kept.
+        are told, and so is why they have no estimate together: those of each alone remain. A file that a resumed run
+        finds, made of the same, is kept.
 
-        Raises what :meth:`estimate` does.
+        Raises what :meth:`estimate` does, but for :class:`TooFewMembersError`.
         """
         config, run = work.config, work.run
         good = [d for d in work.good() if group is None or d.name in group.datasets]
@@ -161,10 +162,13 @@ class TogetherKind(Kind, ABC):
 
         attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
         attributes |= {"group": group.name} if group else {}
-        self._estimate(
-            run, sets, executor, attributes, file, record, [run.identity.settings, *digests],
-            lambda words: run.log.write(f"{what}: {words}"),
-        )  # fmt: skip
+        try:
+            self._estimate(
+                run, sets, executor, attributes, file, record, [run.identity.settings, *digests],
+                lambda words: run.log.write(f"{what}: {words}"),
+            )  # fmt: skip
+        except TooFewMembersError as error:
+            run.notice(f"no {what}; the data sets are estimated alone: {error}")
 
 
 @dataclass(frozen=True)
@@ -300,7 +304,7 @@ class PopulationKind(TogetherKind):
         problems, white = [s.problem for s in sets], [s.white for s in sets]
         asked = config.population.part(HyperPrior) if config.population else HyperPrior()
         hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))
-        with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
+        with retold(ValueError, TooFewMembersError):  # of forward runs that failed
             population = population_of(
                 problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=hyper,
                 effort=self.effort, executor=executor, tell=tell, doubted=_doubted(sets),

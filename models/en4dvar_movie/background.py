@@ -26,6 +26,7 @@ LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by
 LIVELY = 0.4  # share of the rim of a patch that changes in a bubble, not in what stands still
 OFTEN = 0.1  # of the frames: in how many it does
 RESTLESS, LEAST_PAIRS = 0.25, 5  # share and number of steps from frame to frame in which writing changes
+MOST, BLANK = (5, 95), 0.25  # per cent of the pixels; share of the most contrast of writing that it has in any frame
 WRITING = (24, 14, 3)  # pixels: largest height of writing; how far about its changing part the rest of it lies
 LEADING = 40  # frames looked at for the background
 SAMPLES = 24  # frames looked at for what they share
@@ -275,7 +276,9 @@ def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     for number, box in enumerate(ndimage.find_objects(labels), 1):
         rows, columns = np.nonzero(often[box] & (labels[box] == number))
         born_later = not changes[0][box].any()  # a bubble; a time stamp runs from the first frame on
-        if np.ptp(rows) + 1 > height or born_later or _one_way(frames, changes, box):
+        shown = np.ptp(np.percentile([f[box][rows, columns] for f in frames], MOST, axis=1), axis=0)
+        blank = shown.min() < BLANK * shown.max()  # a bubble before or when larger; a stamp always shows
+        if np.ptp(rows) + 1 > height or born_later or blank or _one_way(frames, changes, box):
             continue
         top, left = box[0].start + rows.min() - down, box[1].start + columns.min() - across
         none[max(top, 0) : box[0].start + rows.max() + down + 1,

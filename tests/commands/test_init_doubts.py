@@ -298,12 +298,14 @@ def test_a_rebound_that_no_gel_gives_is_named_and_not_the_collapse(tmp_path: Pat
         (tmp_path / f"{name}.csv").write_text("\n".join(["t_us,R_um", *lines, ""]))
         done = call("init", "--data", f"{name}.csv", *UNITS)
         assert re.search(r"R_max 140 um, collapse 12\.\d us later, (0.99|1.00|1.01) of the Rayleigh time", done.stdout)
-        told = next(line for line in done.stderr.splitlines() if "no G and mu" in line)
-        assert re.search(r"give this rebound to 0\.\d\d R_max: is 17 um its radius at rest \(R_eq\)", told)
+        told = next(line for line in done.stderr.splitlines() if "no G and mu of neo-hookean-kelvin-voigt will" in line)
+        assert re.search(r"will give this rebound to 0\.\d\d R_max: is 17 um its radius at rest \(R_eq\)", told)
         assert "model.gas" in told
         assert "frame rate" not in told
     (problem,) = build(proposed(Path("missing.yaml")))
     assert len(problem.observations.times) > 20  # to the second minimum
+    liquid = call("init", "--data", "whole.csv", *UNITS, "--law", "newtonian", "--force")
+    assert "no mu of newtonian will give this rebound" in liquid.stderr
 
 
 def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from init_files import UNITS, call, proposed, write
 
 from en4dvar_bubble import simulate
 from en4dvar_bubble.collapse import lobe
@@ -26,3 +29,14 @@ def test_the_guess_is_near_the_truth(G: float, mu: float, told: str, most: float
     for name, value in truth.items():
         assert abs(np.log(guess.values[name] / value)) < 2 * guess.log_std[name], name
     assert guess.log_std[told] < most
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_what_relaxes_may_be_anything_that_a_collapse_shows(tmp_path: Path) -> None:
+    """Between the 5 and 95 % of its prior lie 0.1 to 10 µs, and what gels have of viscosity: 0.03 to 0.19 Pa s."""
+    write(tmp_path / "b.csv")
+    assert call("init", "--data", tmp_path / "b.csv", *UNITS, "--law", "zener-neo-hookean").exit_code == 0
+    stated = {entry.parameter.name: entry.spec for entry in proposed(Path("b.yaml")).parameters}
+    for name, low, high in (("relaxation_time", 0.1e-6, 10e-6), ("mu_p", 0.03, 0.19)):
+        term = stated[name]
+        assert abs(np.log([low, high]) - np.log(term.median)).max() < 1.645 * term.log_std

@@ -163,7 +163,7 @@ def test_a_pulse_that_is_an_example_is_told_as_one_and_no_bubble_is_held_against
     done = call("init", "--data", "b.csv", "--start", "acoustic")
     (told,) = (line for line in done.stderr.splitlines() if "pulse is" in line)
     assert "the pulse is an example: enter that of your experiment in the line 'driving' of the model" in told
-    assert "no G and mu" not in done.stderr
+    assert "will give this" not in done.stderr
 
 
 @pytest.mark.parametrize("last", [0.9, 0.3])

@@ -305,6 +305,20 @@ def test_data_sets_that_cannot_be_sampled_are_named():
     assert any("set2 is left out" in c.words for c in _cautions(found))
 
 
+def test_one_draw_that_has_all_the_weight_is_told_as_too_few(monkeypatch):
+    """Nothing can be fitted to it for another round."""
+    problems, weighed = campaign(truths(0.2)), Hierarchy._weighed
+
+    def one_of_all(self, *how):
+        h, logs = weighed(self, *how)
+        return h, np.append(logs[0] + 1e4, logs[1:])
+
+    monkeypatch.setattr(Hierarchy, "_weighed", one_of_all)
+    found = population_of(problems, members(problems), ["a"], 2, kept=known(problems, None), hyper=HYPER, effort=ROUGH)
+    assert found.size < 1.01
+    assert "chain-not-converged" in {c.code for c in _cautions(found)}
+
+
 def test_parameters_must_be_the_same_in_all():
     problems = campaign(truths(0.2))
     other = (OF_A, OF_D, OF_B)

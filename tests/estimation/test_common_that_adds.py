@@ -115,6 +115,15 @@ def test_there_and_back():
     np.testing.assert_allclose(np.exp(1.2 * (y - x)[~kept, 1]), 0.01)
 
 
+def test_far_along_what_is_common_no_two_values_become_one():
+    """A slope of −0.3 (y − 1) shrinks distances by e^{−0.3 θ}; as one step of 1 − 0.3 θ it ends at none, and beyond."""
+    following = Following(np.zeros((1, 1)), np.zeros(1), np.full((1, 1, 1), -0.3), np.ones(1))
+    theta = np.array([[0.5], [3.0], [4.0]])
+    apart = following.together(np.full((3, 1), 2.0), theta) - following.together(np.zeros((3, 1)), theta)
+    np.testing.assert_allclose(apart, 2 * np.exp(-0.3 * theta), rtol=0.06)
+    np.testing.assert_allclose(following.own(following.together(np.zeros((3, 1)), theta), theta), 0.0, atol=1e-12)
+
+
 def test_the_median_one_by_one_of_soft_gels_reaches_as_far_as_what_is_common():
     """Level 0.5, of which what is common may take or add 0.25 for a standard deviation, or all of it."""
     term = PriorTerm.lognormal(Parameter("G", "Pa"), 1.0, LOG_STD)

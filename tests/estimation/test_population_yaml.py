@@ -112,6 +112,17 @@ def test_killed_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     assert_same_results(whole.directory, tmp_path / "cut")
 
 
+def test_data_sets_without_a_population_are_reported_alone(tmp_path, monkeypatch):
+    def none(*_, **__):
+        raise ValueError("none of the populations that were drawn explains the data")
+
+    monkeypatch.setattr("en4dvar.runs.together.population_of", none)
+    result = CliRunner().invoke(main, ["run", str(springs(tmp_path, n=3)), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 0, result.output
+    assert "no population; the data sets are estimated alone: none of the populations" in result.output
+    assert {"report.html", "summary.csv"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
 @pytest.mark.parametrize(
     ("n", "asked", "words"),
     [

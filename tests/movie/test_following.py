@@ -57,6 +57,19 @@ def test_what_looks_like_a_lamp_writing_light_or_a_wall_does_not_lose_the_bubble
     assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
 
 
+def test_a_small_bubble_at_rest_is_no_time_stamp():
+    """It trembles by a third of a pixel, so that its rim becomes brighter here and darker there in every frame."""
+    rng, radii = np.random.default_rng(5), np.append(np.linspace(12, 25, 5), np.full(30, 6.5))
+    y, x = np.mgrid[:96, :96]
+    frames = [np.full((96, 96), 150.0)]
+    for radius in radii:
+        left, top = 47 + 0.3 * rng.standard_normal(2)
+        frames.append(150 - 130 / (1 + np.exp((np.hypot(x - left, y - top) - radius) / 0.6)))
+    noisy = [(frame + 3 * rng.standard_normal(frame.shape)).round().astype(np.uint8) for frame in frames]
+    radius, _ = read(SimpleNamespace(frames=noisy))
+    np.testing.assert_allclose(radius[1:], radii, atol=0.2)
+
+
 @pytest.mark.slow
 def test_a_lamp_that_flickers_does_not_make_a_bubble_bright():
     of = nasty("flicker", 8)

@@ -25,6 +25,7 @@ NODES, NODE_WEIGHTS = np.array([-math.sqrt(3.0), 0.0, math.sqrt(3.0)]), np.array
 TINY = np.finfo(float).tiny
 LARGE, CHANGE = 3.0, 0.3  # of slopes, and of them along a prior standard deviation, in units of the prior
 NARROWEST = 1e-12  # variance of y, where what is common decides it alone
+STEPS = 16  # along θ, of a B that changes
 LEVELS = ndtri((np.arange(200) + 0.5) / 200)  # equally likely values of a normal quantity
 
 
@@ -58,9 +59,13 @@ class Following:
         return slopes if self.bends is None else slopes + np.einsum("dk,jck->djc", y - self.centre, self.bends)
 
     def _grown(self, theta: Array) -> Array:
-        """(…, p, p): ∂x/∂y, but for what adds."""
+        """(…, p, p): ∂x/∂y, but for what adds; in :data:`STEPS` along θ: one long step folds where B changes much,
+        where all y have one x and populations that no data set allows would explain all.
+        """
         of_all = np.broadcast_to(np.eye(len(self.slopes)), (*theta.shape[:-1], *[len(self.slopes)] * 2))
-        return of_all if self.bends is None else of_all + np.einsum("...c,jck->...jk", theta, self.bends)
+        if self.bends is None:
+            return of_all
+        return np.linalg.matrix_power(of_all + np.einsum("...c,jck->...jk", theta, self.bends / STEPS), STEPS)
 
     def _moved(self, x: Array, shift: Array) -> Array:
         adds, moved = self.logs > 0, x + shift

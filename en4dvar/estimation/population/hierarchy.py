@@ -175,7 +175,7 @@ class Hierarchy:
         """Deterministic in ``seed``. Raises :class:`ValueError`: no population that was tried explains the data."""
         stream = member_stream(seed, "population")
         h, logs = self._weighed(self._walked(stream, effort), stream, effort)
-        if effective_number(shares_of(logs)) < effort.effective:  # once more, from what the weights say
+        if h.shape[1] < effective_number(shares_of(logs)) < effort.effective:  # once more, from what the weights say
             again = h[resampled(shares_of(logs), FIT, stream)]
             second, its_logs = self._weighed(again, stream, effort)
             if effective_number(shares_of(its_logs)) > effective_number(shares_of(logs)):

@@ -31,6 +31,13 @@ GRID: Mapping[str, Array] = {"G": np.geomspace(50.0, 2e5, 25), "mu": np.geomspac
 OF_GELS: Mapping[str, tuple[float, float]] = {"G": (5e3, 1.5), "mu": (0.08, 1.2)}
 """Medians (SI) and log_std of what is known of a gel without its history, wide enough for those that bubbles were used
 on: 0.03 (Mancia 2021) to 0.19 Pa s (Yang 2020), a tenth of a kPa to some tens."""
+STIFFENING = (0.05, 3.0)  # median and log_std of α: one of 0.001 is none, for 4 α λ < 5/2 at a pulse's λ of hundreds
+RELAXING = {"mu_p": OF_GELS["mu"], "relaxation_time": (1e-6, 1.5)}  # median (SI) and log_std: 0.08 to 12 µs
+SPAN = {
+    "alpha": "none (neo-Hookean: fix it at 0), agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)",
+    "mu_p": "as mu of gels",
+    "relaxation_time": "within what a collapse can show",
+}
 TOLERANCE = {"R_max": 0.05, "t_c": 0.05, "rebound": 0.15}  # s, of the logarithm
 FAR = 3.0  # in units of s: no node reproduces the observed numbers
 POINTS = 400

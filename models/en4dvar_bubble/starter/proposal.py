@@ -24,7 +24,7 @@ from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped, Together, ends_with
-from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
+from en4dvar_bubble.starter.guess import FAR, OF_GELS, RELAXING, SPAN, STIFFENING, Guess, first_guess
 from en4dvar_bubble.starter.look import (
     COLLAPSED,
     TOP_WIDTH,
@@ -58,8 +58,6 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
-STIFFENING = (0.05, 3.0)  # median and log_std of α: one of 0.001 is none, for 4 α λ < 5/2 at a pulse's λ of hundreds
-SPAN = {"alpha": "none (neo-Hookean: fix it at 0), agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
 LEAST_SHIFT = 0.1  # of the step between samples: of the prior of the clock
 TIMING = 0.05  # of the step between samples
 SAME_STEP = 1.1  # of films whose largest and smallest steps differ by less
@@ -194,7 +192,8 @@ def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
         "rebound": f"is {rest} its radius at rest (R_eq), and does its gas lose heat as the model's does (model.gas)?",
     }
     questions = [asked[name] for name in names if name in asked]
-    return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
+    free = " and ".join(p.name for p in model.law.parameters if p.name in WIDTHS)
+    return f"no {free} of {model.law.name} will give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
 def _implausible(look: Look, coated: bool) -> str:
@@ -441,14 +440,14 @@ def _parameters(
 
 
 def example(p: Parameter, model: BubbleModel) -> Entry:
-    """A prior about the law's example value; of α, and of a gel's G and μ, one that spans the gels."""
+    """A prior about the law's example value; of α, a gel's G and μ, and what relaxes, one that spans what is known."""
     if p.name in elsewhere.COATING:
         return elsewhere.COATING[p.name]
-    gels = {"alpha": STIFFENING}
+    gels = {"alpha": STIFFENING, **RELAXING}
     if any(other.name == "G" for other in model.law.parameters):
         gels |= OF_GELS
     if p.name in gels:
-        return _spread(p, *gels[p.name], f"{SPAN.get(p.name, 'of gels')};", "know of your gel")
+        return _spread(p, *gels[p.name], f"{SPAN.get(p.name, 'of gels')},", "know of yours")
     text = _text(float(model.law.example_values()[p.name][0]), p.unit, p.display_unit)
     words = "an example value, not from the data"
     if p.transform == "lognormal":
