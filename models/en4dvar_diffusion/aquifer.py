@@ -90,7 +90,7 @@ class Aquifer(ForwardModel):
         )
         for duration in durations:
             steps = math.ceil(duration / self.longest - 1e-9)
-            rate = round(storage * steps / duration, 12) if steps else 0.0  # of times as they are rounded, one
+            rate = float(f"{storage * steps / duration:.12g}") if steps else 0.0  # of times as they are rounded, one
             for _ in range(steps):
                 if rate not in solvers:
                     system = (identity(self.size, format="csc") * rate + flow).tocsc()

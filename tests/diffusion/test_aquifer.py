@@ -49,6 +49,21 @@ def test_the_state_goes_on_where_it_is():
         assert np.max(np.abs(state - path.states[k])) < 1e-13
 
 
+@pytest.mark.parametrize("power", [-40, 40])
+def test_heads_do_not_depend_on_the_unit_of_time(power):
+    """T and recharge are per time: in a unit 2^power times as long both are as many times as large, times as small."""
+    times, ln_T, unit = np.array([1.0, 3.0, 7.3]), 0.5 * np.random.default_rng(3).standard_normal(30), 2.0**power
+
+    def heads(unit):
+        aquifer = Aquifer((6, 5), 2.0 / unit)
+        state = aquifer.initial_state({"recharge": 0.01 * unit, "storage": 0.1})
+        state[aquifer.layout["ln_T"]] = ln_T + np.log(unit)
+        (path,) = aquifer.trajectories(state[None], times / unit)
+        return path["head"]
+
+    np.testing.assert_allclose(heads(unit), heads(1.0), rtol=1e-10)
+
+
 def test_the_shipped_readings_are_those_of_the_command():
     file = Path(__file__).parents[2] / "configs/data/aquifer_heads.csv"
     assert readings() == file.read_text(encoding="utf-8")
