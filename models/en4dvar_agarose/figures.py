@@ -9,7 +9,7 @@ from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
 from en4dvar_agarose.fits import LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
-from en4dvar_agarose.run import named
+from en4dvar_agarose.settings import named
 from en4dvar_bubble.model import BubbleModel
 
 # line styles tell the same as colours, for print without colour

@@ -7,7 +7,6 @@ agrees.
 """
 
 import math
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -40,7 +39,7 @@ from en4dvar.runs.rundir import RunDirectory
 from en4dvar.sampling.sweep import SweepResult, SweepSettings, run_sweep
 from en4dvar_agarose.fits import HYPER, UNSURE, Comparison, Fit, OneByOne, OneGel, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
-from en4dvar_agarose.settings import StudyPlan
+from en4dvar_agarose.settings import StudyPlan, named
 from en4dvar_bubble.model import BubbleModel
 
 D = TypeVar("D")
@@ -108,11 +107,6 @@ def identity_of(seed: int, sweep: SweepSettings, configs: Mapping[str, Config]) 
         data += [(f"{name}, {dataset}", digest) for dataset, digest in own.data]
     settings = {"seed": seed, "sweep": asdict(sweep), "configurations": each, **common}
     return Identity(yaml_text(settings), tuple(data))
-
-
-def named(*words: str) -> str:
-    """Words as part of a file's name."""
-    return re.sub(r"[^A-Za-z0-9]+", "_", " ".join(words)).strip("_").lower()
 
 
 Say = Callable[[str], None]

@@ -1,5 +1,6 @@
 """The study's YAML file: which configurations make it up, how large the sweep is, where a twin's truth is."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,6 +72,11 @@ class StudyPlan:
         return {f"{gel}, {model}": config for gel, models in self.configs.items() for model, config in models.items()}
 
 
+def named(*words: str) -> str:
+    """Words as part of a file's name."""
+    return re.sub(r"[^A-Za-z0-9]+", "_", " ".join(words)).strip("_").lower()
+
+
 def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> StudyPlan:
     """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""
     path = Path(path)
@@ -81,6 +87,11 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
         raise ConfigError(faults)
     base = path.resolve().parent
     configs = {gel: _configs(gel, files, base, document, faults) for gel, files in top.gels.items()}
+    gels = {named(gel): gel for gel in reversed(top.gels)}
+    for gel in top.gels:
+        if (other := gels[named(gel)]) != gel:
+            words = f"its files would have the names of those of {other!r}; let letters or digits of the labels differ"
+            faults.append(document.fault(("gels", gel), words, at_key=True))
     if top.truth and not top.synthetic:
         faults.append(document.fault(("truth",), "only a synthetic campaign has a truth"))
     truth = base / top.truth if top.truth else None

@@ -246,6 +246,17 @@ def test_faults_of_the_study_file(tmp_path):
     assert "write one of nh, qs, qlkv" in told
 
 
+def test_gels_whose_files_would_have_one_name_are_refused(tmp_path):
+    """Draws of one would be taken for those of the other, and its figures overwritten."""
+    (tmp_path / "s.yaml").write_text(
+        "name: s\nsynthetic: true\ngels:\n  Gel +: {nh: none.yaml}\n  gel −: {nh: none.yaml}\n  gel: {nh: none.yaml}\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_study(tmp_path / "s.yaml")
+    told = [line for line in str(caught.value).splitlines() if "would have the names of those of 'Gel +'" in line]
+    assert ["s.yaml:5:3" in told[0], "s.yaml:6:3" in told[1], len(told)] == [True, True, 2]
+
+
 def test_collapse_of_a_known_history():
     times = np.arange(0.0, 20.0, 1.0)
     radius = 100 - (times - 9.3) ** 2
