@@ -135,7 +135,8 @@ def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple
         for name in names:
             if name not in group.variables:
                 raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
-            variable = group.variables.get(f"{name}_next", group.variables[name])
+            following = group.variables.get(f"{name}_next") if "without_hyperprior" in file.groups else None
+            variable = group.variables[name] if following is None else following
             values = _numbers(path, variable)
             values = values[alive] if alive is not None and len(alive) == len(values) else values
             members[name] = values, str(getattr(variable, "units", ""))

@@ -48,15 +48,15 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
         "effective_draws": estimate.members.effective,
         "warnings": _lines(estimate.cautions),
     }
-    prior, of_each = {}, {}
+    prior, of_each, called = {}, {}, variable_names(estimate)
     for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True):
         own = [m if of.get(key[0]) == key[1] else None for m, of in zip(alone, estimate.joint.groups, strict=True)]
-        of_each[shared_name(key)] = _alone(term.parameter, estimate.joint.experiments, own)
+        of_each[called[key]] = _alone(term.parameter, estimate.joint.experiments, own)
         quantiles = term.to_physical(term.mean + term.std * np.array([-1.6448536, 0.0, 1.6448536]))
-        prior[shared_name(key)] = variable("quantile", quantiles, term.parameter.unit, "prior")
+        prior[called[key]] = variable("quantile", quantiles, term.parameter.unit, "prior")
     groups = {
         "/": Group(attrs=root),
-        "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
+        "/posterior": Group(_shared(estimate, called) | _own(estimate, names, called), datasets),
         "/prior": Group(prior),
         "/alone": Group(of_each, datasets),
         "/fit": Group(_fit(estimate, names), datasets),
@@ -64,7 +64,7 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
     if estimate.without:
         rest, kept = estimate.rest, list(estimate.rest.joint.names)
         others, warned = {"dataset": variable("dataset", text(kept), "", "data set")}, _lines(rest.cautions)
-        groups["/without"] = Group(_shared(rest) | _own(rest, kept), others, {"warnings": warned})
+        groups["/without"] = Group(_shared(rest, called) | _own(rest, kept, called), others, {"warnings": warned})
     return to_bytes(groups).write(path)
 
 
@@ -72,11 +72,25 @@ def _lines(cautions: Sequence[Caution]) -> str:
     return "\n".join(c.line for c in worst_first(cautions))
 
 
-def shared_name(key: tuple[str, str]) -> str:
-    """Variable of a shared quantity: its name, and its group where that is not everyone."""
-    name, group = key
-    plain = "".join(c if c.isalnum() else "_" for c in group)
-    return f"{name}_{plain}" if plain else name
+Called = Mapping[tuple[str, str | None], str]
+
+
+def variable_names(estimate: JointEstimate) -> Called:
+    """Variable of each quantity: of a shared one (name, group) its name, and its group where that is not everyone; of
+    one that data sets have of their own (name, None) its name. One that is taken gets ``_own`` or ``_`` behind it.
+    """
+    joint, called = estimate.joint, dict[tuple[str, str | None], str]()
+    for name, group in joint.shared:
+        plain = "".join(c if c.isalnum() else "_" for c in group)
+        called[name, group] = _free(f"{name}_{plain}" if plain else name, called)
+    each = zip(joint.experiments, joint.groups, strict=True)
+    for name in dict.fromkeys(name for e, shared in each for name in e.prior.names if name not in shared):
+        called[name, None] = _free(f"{name}_own" if name in called.values() else name, called)
+    return called
+
+
+def _free(name: str, called: Called) -> str:
+    return _free(f"{name}_", called) if name in called.values() else name
 
 
 def of_parameter(p: Parameter, dims: str | tuple[str, ...], values: Any, words: str = "", **more: Any) -> Variable:
@@ -84,12 +98,12 @@ def of_parameter(p: Parameter, dims: str | tuple[str, ...], values: Any, words: 
     return variable(dims, values, p.unit, words or p.label, symbol=p.symbol, display_units=p.display_unit, **more)
 
 
-def _shared(estimate: JointEstimate) -> dict[str, Variable]:
+def _shared(estimate: JointEstimate, called: Called) -> dict[str, Variable]:
     variables = {}
     for j, (key, term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
         label = ", ".join(filter(None, (term.parameter.label, key[1])))
         members, mode = estimate.shared[None, :, j], float(estimate.shared_mode[j])
-        variables[shared_name(key)] = of_parameter(term.parameter, DRAWS, members, label, mode=mode)
+        variables[called[key]] = of_parameter(term.parameter, DRAWS, members, label, mode=mode)
     return variables
 
 
@@ -102,7 +116,7 @@ def _alone(p: Parameter, problems: Sequence[InverseProblem], alone: Sequence[Arr
     return variable(("dataset", "quantile"), rows, p.unit, "5, 50 and 95 % of a data set alone")
 
 
-def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
+def _own(estimate: JointEstimate, names: Sequence[str], called: Called) -> dict[str, Variable]:
     """(chain, draw, dataset) of the parameters that data sets have of their own, NaN where one has it not."""
     count = len(estimate.members.border)
     values: dict[str, Array] = {}
@@ -113,10 +127,8 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
             p = experiment.prior.parameters[j]
             values.setdefault(p.name, np.full((1, count, len(names)), np.nan))[0, :, e] = members[:, j]
             parameters[p.name] = p
-    taken = {shared_name(key) for key in estimate.joint.shared}
     return {
-        f"{name}_own" if name in taken else name: of_parameter(parameters[name], (*DRAWS, "dataset"), array)
-        for name, array in values.items()
+        called[name, None]: of_parameter(parameters[name], (*DRAWS, "dataset"), array) for name, array in values.items()
     }
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -115,13 +116,13 @@ def _kept_draws(problem: InverseProblem, result: StoredResult) -> OwnDraws | Non
 
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
-    seen: dict[str, int] = {}
+    taken, seen = {s.name for s in sets}, set[str]()
     for s in sets:
-        seen[s.name] = seen.get(s.name, 0) + 1
-        if seen[s.name] > 1:
-            o = s.problem.observations
-            problem = replace(s.problem, observations=replace(o, name=f"{s.name}_{seen[s.name]}"))
-            s = replace(s, problem=problem)
+        if (name := s.name) in seen:
+            name = next(other for n in count(2) if (other := f"{s.name}_{n}") not in taken)
+            s = replace(s, problem=replace(s.problem, observations=replace(s.problem.observations, name=name)))
+        taken.add(name)
+        seen.add(name)
         yield s
 
 

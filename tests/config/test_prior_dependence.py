@@ -9,6 +9,7 @@ from toy_config import write_toy
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
+from en4dvar.inputs.members import netcdf_members
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.runner import run
 
@@ -95,6 +96,17 @@ def test_the_posterior_of_a_run_is_the_prior_of_the_next(tmp_path):
     assert prior.mean == pytest.approx([posterior[:, 0].mean(), np.log(posterior[:, 1]).mean()], rel=1e-10)
     x = np.stack([posterior[:, 0], np.log(posterior[:, 1])])
     assert np.cov(prior.sample(12, 1).T) == pytest.approx(np.cov(x), rel=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "taken"), [("posterior", "k"), ("without_hyperprior", "k_next")])
+def test_only_of_a_population_the_next_data_set_is_taken(tmp_path, kind, taken):
+    """A parameter of a run may be called ``k_next``."""
+    drawn = {"A": np.arange(9.0), "k": 1.0 + np.arange(9.0), "k_next": 50.0 + np.arange(9.0)}
+    write_netcdf(tmp_path / "other.nc", drawn, units=("m", "N/m", "N/m"), group="posterior")
+    with netCDF4.Dataset(tmp_path / "other.nc", "a") as file:
+        file.createGroup(kind)
+    (held,) = netcdf_members(tmp_path / "other.nc", ["A", "k"])
+    np.testing.assert_array_equal(held["k"][0], drawn[taken])
 
 
 def test_csv_with_stated_units(tmp_path):

@@ -15,13 +15,14 @@ from toys import Vectorised, make_observations
 from en4dvar.cli import main
 from en4dvar.estimation.joint import estimate_jointly, sharing
 from en4dvar.estimation.joint.agreement import Statement, agreement
+from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, common_to
 from en4dvar.report.together import write_joint
 from en4dvar.results.netcdf import read_groups, to_bytes
-from en4dvar.results.together import load_joint
+from en4dvar.results.together import load_joint, save_joint
 from en4dvar.runs.runner import run_campaign
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -156,3 +157,22 @@ def test_a_configuration_says_so_too(oscillators, tmp_path):
         run_campaign(configuration(oscillators, run))
         assert load_joint(run / "joint.nc").shared == found
     oscillators.write_text(text)
+
+
+def test_groups_whose_names_differ_in_signs_keep_their_variables(tmp_path):
+    """``b`` of the groups −5 and +5, and own quantities called as those of groups and of data sets are."""
+    model, times = Vectorised(names=("a", "b", "b_own")), np.linspace(0.1, 2.5, 5)
+    prior = Prior(tuple(PriorTerm.normal(p, 0.3, 0.9) for p in model.parameters))
+    data = [make_observations(times, np.cos(times + e), std=0.3, name=f"set {e}") for e in range(3)]
+    problems = [InverseProblem(model, model.observables[0], one, prior) for one in data]
+    joint = JointProblem(tuple(problems), ({"b": "+5"}, {"b": "-5"}, {"a": ""}))  # b is the last one's own
+    found = estimate_jointly(joint, AssimilationSettings(what_if=False, emulator="off", refine="none"), 3)
+    save_joint(tmp_path / "joint.nc", found, [np.zeros((3, 3))] * 3, {})
+    stored = load_joint(tmp_path / "joint.nc")
+    posterior = stored.group("posterior")
+    assert stored.shared == ("b__5", "b__5_", "a")
+    assert [posterior[name].attrs["long_name"] for name in stored.shared[:2]] == ["b, +5", "b, -5"]
+    for j, name in enumerate(stored.shared):
+        np.testing.assert_array_equal(posterior[name].values[0], found.shared[:, j])
+    own = {name for name, values in posterior.data_vars.items() if "dataset" in values.dims}
+    assert own == {"a_own", "b", "b_own"}

@@ -17,7 +17,7 @@ from en4dvar.cli import main
 from en4dvar.data.noise import noise_of
 from en4dvar.data.noise.correlated import SharedErrors
 from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import Draws, Population, population_of
+from en4dvar.estimation.population.campaign import Draws, Population, population_of, require_population
 from en4dvar.estimation.population.campaign import _draws as of_white
 from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.model.state import READING_OFFSET, READING_SCALE
@@ -28,7 +28,7 @@ from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem
 from en4dvar.report.together import forest, sentences
 from en4dvar.results.together import load_population
-from en4dvar.runs.finished import finished
+from en4dvar.runs.finished import Finished, _named_apart, finished
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import _cautions, _doubted, population
 
@@ -178,6 +178,24 @@ def test_bad_questions(campaign, tmp_path):
     result = CliRunner().invoke(main, ["population", str(campaign), "--of", "c"])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("what", ["median", "mean", "between", "next"])
+def test_a_parameter_called_as_a_number_of_the_population_is_refused(what):
+    """The draws of each data set would take the place of those of the population of ``a`` in the file."""
+    model = Vectorised(names=("a", f"a_{what}"))
+    problems = [make_problem(model, (1.0, 0.4), seed=s) for s in range(4)]
+    with pytest.raises(ConfigError, match=f"a_{what}: the {what} of the population of a has this name, too"):
+        require_population(problems, ["a"])
+    require_population(problems, [f"a_{what}"])
+
+
+def test_data_sets_of_several_runs_get_names_that_none_has():
+    """Of runs with the data sets (x, x_2), (x) and (x) together."""
+    problem, nothing = make_problem(Vectorised(), (1.0, 0.4)), np.empty(0)
+    named = (replace(problem.observations, name=name) for name in ("x", "x_2", "x", "x"))
+    sets = [Finished(None, replace(problem, observations=o), nothing, nothing, nothing, (), {}, None) for o in named]
+    assert [s.name for s in _named_apart(sets)] == ["x", "x_2", "x_3", "x_4"]
 
 
 def linear(seed: int = 4) -> list:

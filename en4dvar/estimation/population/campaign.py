@@ -189,6 +189,10 @@ def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[
 def require_population(problems: Sequence[InverseProblem], names: Sequence[str]) -> None:
     """Raises :class:`ConfigError`, see :func:`population_of`."""
     terms_of(problems, names)
+    every = problems[0].constant.prior.names
+    for name, what in ((name, of.name) for name in names for of in fields(Draws) if f"{name}_{of.name}" in every):
+        called = f"{name}_{what}"  # in files
+        raise ConfigError(f"{called}: the {what} of the population of {name} has this name, too; call one otherwise")
     for problem in problems:
         name = problem.observations.name
         check_problem(problem)
