@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.config.document import override, read_document
+from en4dvar.config.document import override, parse_document, read_document
 from en4dvar.config.kinds import resolve_campaign, terms_and_fixed
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.runs.simulation import draw_campaign
+from en4dvar.runs.simulation import draw_campaign, write_campaign
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -43,6 +43,29 @@ def test_shipped_files_are_what_the_configuration_draws(tmp_path):
             np.testing.assert_allclose(
                 np.loadtxt(told[1:], delimiter=","), np.loadtxt(kept[1:], delimiter=","), atol=2e-3
             )
+
+
+SMALL = """
+name: small
+model: {name: toy_models:Oscillator}
+campaign:
+  directory: data
+  first: [0 s, 1e-8 s]
+  spacing: [1e-7 s, 2e-7 s]
+  stop: 0.3
+  noise: 1e-12 m
+  groups: {a: {datasets: 1, parameters: {A: 1e-10 m, k: 1e12 N/m, c: 0.0 N s/m}}}
+"""
+
+
+def test_small_readings_and_short_times_are_written_with_their_digits(tmp_path):
+    """Of an oscillation of 1 MHz and 0.1 nm, in s and µm; five decimals would be zeros."""
+    drawn = resolve_campaign(parse_document(SMALL, "small.yaml"), tmp_path)
+    (one,) = draw_campaign(drawn)
+    write_campaign(drawn, (one,), tmp_path / "data", "simulate")
+    times, values = np.loadtxt(tmp_path / "data" / "a_01.csv", delimiter=",", skiprows=4).T
+    np.testing.assert_allclose(times, one.times, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(1e-6 * values, one.values, rtol=0, atol=1e-15)
 
 
 def test_numbers_of_the_experiment(sets):
