@@ -75,7 +75,7 @@ class Aquifer(ForwardModel):
         return np.array([self._path(state, times)["head"][:, cells].ravel() for state in states])
 
     def _path(self, state: Array, times: Array) -> Trajectory:
-        states = np.tile(state, (len(times), 1))
+        states = np.tile(np.asarray(state, dtype=float), (len(times), 1))
         for row, head in zip(states, self._heads(state, np.diff(times, prepend=0.0)), strict=True):
             row[: self.size] = head
         return Trajectory(np.asarray(times, dtype=float), states, self.layout)

@@ -37,12 +37,12 @@ class Autonomous(ForwardModel):
         return np.concatenate([self.initial, [theta[p.name] for p in self.parameters]])
 
     def step(self, x: np.ndarray, t0: float, t1: float) -> np.ndarray:
-        return np.asarray(self.integrate(x[None], np.array([[t1 - t0]]), self.longest_step)[0, 0])
+        return np.asarray(self.integrate(np.array([x], dtype=float), np.array([[t1 - t0]]), self.longest_step)[0, 0])
 
     def trajectories(self, x: np.ndarray, times: np.ndarray) -> Batch:
         own = np.empty((len(x), np.shape(times)[-1]))
         own[:] = times
-        return Batch(own, self.integrate(np.ascontiguousarray(x), own, self.longest_step), self.layout)
+        return Batch(own, self.integrate(np.ascontiguousarray(x, dtype=float), own, self.longest_step), self.layout)
 
 
 class Analytic(Autonomous):

@@ -64,6 +64,13 @@ def test_heads_do_not_depend_on_the_unit_of_time(power):
     np.testing.assert_allclose(heads(unit), heads(1.0), rtol=1e-10)
 
 
+def test_heads_of_a_state_of_whole_numbers_are_no_whole_numbers():
+    aquifer, times = Aquifer((3, 3)), np.array([1.0, 5.0])
+    state = aquifer.initial_state({"recharge": 1, "storage": 1})
+    exact, other = (aquifer.trajectories(x[None], times)[0]["head"] for x in (state, state.astype(int)))
+    np.testing.assert_allclose(other, exact, rtol=1e-12)
+
+
 def test_the_shipped_readings_are_those_of_the_command():
     file = Path(__file__).parents[2] / "configs/data/aquifer_heads.csv"
     assert readings() == file.read_text(encoding="utf-8")

@@ -44,6 +44,19 @@ def state(model, x=None):
     return start
 
 
+@pytest.mark.parametrize("kind", [int, np.float32, ">f8"])
+@pytest.mark.parametrize("name", MODELS)
+def test_a_state_of_other_numbers_is_integrated_in_double_precision(name, kind):
+    """Whole numbers were integrated in whole numbers."""
+    model, times = MODELS[name], np.array([0.1, 0.3])
+    start = np.arange(1.0, model.layout.size + 1)
+    expected = model.trajectories(start[None], times)[0].states
+    assert np.ptp(expected[:, 0]) > 0.01
+    other = start.astype(kind)
+    np.testing.assert_allclose(model.trajectories(other[None], times)[0].states, expected, rtol=1e-12)
+    np.testing.assert_allclose(model.step(other, 0.0, 0.1), expected[0], rtol=1e-12)
+
+
 def lorenz63_by_hand(t, v):
     x, y, z = v
     return [10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z]
