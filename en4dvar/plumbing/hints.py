@@ -1,6 +1,7 @@
 """Suggestions for misspelt names and missing files."""
 
 import functools
+import itertools
 import re
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
@@ -93,6 +94,16 @@ def numbered(name: str) -> list[str | int]:
     ['bubble2', 'bubble10']
     """
     return [int(s) if i % 2 else s for i, s in enumerate(re.split(r"([0-9]{1,40})", name))]
+
+
+def free_name(name: str, others: Collection[str]) -> str:
+    """The name, with a number behind it where one of ``others`` is the same.
+
+    >>> free_name("gel", []), free_name("gel", ["gel", "gel_2"])
+    ('gel', 'gel_3')
+    """
+    same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+    return next(it for it in same if it not in others)
 
 
 def nearest(name: str, others: Collection[str]) -> str:

@@ -13,7 +13,7 @@ from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.errors import ConfigError, OutputError, retold
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import free_name, listed
 from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
@@ -115,14 +115,11 @@ def _kept_draws(problem: InverseProblem, result: StoredResult) -> OwnDraws | Non
 
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
-    seen: dict[str, int] = {}
+    names: dict[str, None] = {}
     for s in sets:
-        seen[s.name] = seen.get(s.name, 0) + 1
-        if seen[s.name] > 1:
-            o = s.problem.observations
-            problem = replace(s.problem, observations=replace(o, name=f"{s.name}_{seen[s.name]}"))
-            s = replace(s, problem=problem)
-        yield s
+        names[name := free_name(s.name, names)] = None
+        observations = replace(s.problem.observations, name=name)
+        yield replace(s, problem=replace(s.problem, observations=observations))
 
 
 def sampled_evidences(run_dir: Path, workers: int | None, trust: bool, tell: Callable[[str], None]) -> dict[str, float]:

@@ -6,6 +6,7 @@ were. When a series ends is decided by its readings alone, never by the truth. N
 even one that noise puts below zero: that would bias the noise, and with it whatever such readings tell.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from en4dvar.priors.prior import member_stream
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
+THOUSANDTH = 3  # decimals, of the noise and of the time between readings, that numbers in files have at least
 
 
 @dataclass(frozen=True)
@@ -191,13 +193,16 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}".removesuffix(" 1") for name, v in simulation.theta.items())
     columns = [time, *columns]
     comments = [*comment.splitlines(), f"parameters: {truth}", ", ".join(f"{c.name} in {c.unit}" for c in columns)]
-    return _commented(comments, columns, [simulation.times, *simulation.series.values()], ".9g")
+    values = [simulation.times, *simulation.series.values()]
+    return _commented(comments, columns, values, [".9g"] * len(columns))
 
 
-def _commented(comments: Sequence[str], columns: Sequence[Column], values: Sequence[Array], form: str) -> str:
-    """Values (K,) of each column in its unit, written in a form, as CSV below comments and names."""
+def _commented(
+    comments: Sequence[str], columns: Sequence[Column], values: Sequence[Array], forms: Sequence[str]
+) -> str:
+    """Values (K,) of each column in its unit, each written in its form, as CSV below comments and names."""
     written = (convert(v, column.target, column.unit) for column, v in zip(columns, values, strict=True))
-    rows = (",".join(f"{value:{form}}" for value in row) for row in zip(*written, strict=True))
+    rows = (",".join(map(format, row, forms)) for row in zip(*written, strict=True))
     return "\n".join([*(f"# {line}" for line in comments), ",".join(c.name for c in columns), *rows]) + "\n"
 
 
@@ -277,13 +282,17 @@ def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> 
     model, seen = plan.model, plan.model.observables[0]
     t = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     v = Column(f"{seen.symbol.strip('$')}_{seen.display_unit}", seen.display_unit, seen.unit)
-    noise = convert(plan.file.campaign.noise, seen.unit, seen.display_unit)
+    noise, spacing = (
+        convert(size, c.target, c.unit)
+        for size, c in ((plan.file.campaign.noise, v), (plan.file.campaign.spacing[0], t))
+    )
     comments = [
         f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
         f"{command}; seed {plan.file.seed}",
         f"{t.name} in {t.unit}, {v.name} in {v.unit}; noise std {noise:.9g} {v.unit}",
     ]
-    return _commented(comments, [t, v], [dataset.times, dataset.values], ".5f")
+    forms = [f".{max(5, THOUSANDTH - math.floor(math.log10(size)))}f" for size in (spacing, noise)]
+    return _commented(comments, [t, v], [dataset.times, dataset.values], forms)
 
 
 def truth_csv(plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...]) -> str:

@@ -319,6 +319,13 @@ def test_one_draw_that_has_all_the_weight_is_told_as_too_few(monkeypatch):
     assert "chain-not-converged" in {c.code for c in _cautions(found)}
 
 
+def test_two_data_sets_of_one_name_would_have_the_same_random_numbers():
+    problems = campaign(truths(0.2))
+    problems[1] = replace(problems[1], observations=replace(problems[1].observations, name="set2"))
+    with pytest.raises(ConfigError, match="a population need different names: set2 twice"):
+        population_of(problems, members(problems), ["a"], 2)
+
+
 def test_parameters_must_be_the_same_in_all():
     problems = campaign(truths(0.2))
     other = (OF_A, OF_D, OF_B)

@@ -15,13 +15,14 @@ from toys import Vectorised, make_observations
 from en4dvar.cli import main
 from en4dvar.estimation.joint import estimate_jointly, sharing
 from en4dvar.estimation.joint.agreement import Statement, agreement
+from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, common_to
 from en4dvar.report.together import write_joint
 from en4dvar.results.netcdf import read_groups, to_bytes
-from en4dvar.results.together import load_joint
+from en4dvar.results.together import load_joint, save_joint
 from en4dvar.runs.runner import run_campaign
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -156,3 +157,14 @@ def test_a_configuration_says_so_too(oscillators, tmp_path):
         run_campaign(configuration(oscillators, run))
         assert load_joint(run / "joint.nc").shared == found
     oscillators.write_text(text)
+
+
+def test_groups_whose_names_differ_in_signs_alone_are_kept_apart(tmp_path):
+    problems, settings = campaign(), AssimilationSettings(what_if=False, emulator="off", refine="none")
+    groups = tuple({"a": "", "b": ("gel 1", "gel-1")[e % 2]} for e in range(SETS))
+    found = estimate_jointly(JointProblem(tuple(problems), groups), settings, 3)
+    save_joint(tmp_path / "joint.nc", found, [np.zeros((3, 3))] * SETS, {})
+    stored = load_joint(tmp_path / "joint.nc")
+    assert stored.shared == ("a", "b_gel_1", "b_gel_1_2")
+    for j, name in enumerate(stored.shared):
+        np.testing.assert_array_equal(stored.group("posterior")[name].values[0], found.shared[:, j])

@@ -226,13 +226,16 @@ def population_of(
 
     Raises
     ------
-    ConfigError: fewer than 3 data sets; readings that would count twice; other parameters in one than in another, or
-        such as vary in time; a prior of ``names`` that is correlated, or not the same in all. ValueError: fewer than 3
-        data sets have successful runs.
+    ConfigError: fewer than 3 data sets, or two of one name, which random numbers belong to; readings that would count
+        twice; other parameters in one than in another, or such as vary in time; a prior of ``names`` that is
+        correlated, or not the same in all. ValueError: fewer than 3 data sets have successful runs.
     """
     if len(problems) < FEWEST_SETS:
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
+    called = [problem.observations.name for problem in problems]
+    if twice := sorted({name for name in called if called.count(name) > 1}):
+        raise ConfigError(f"data sets of a population need different names: {', '.join(twice)} twice")
     require_distinct([problem.observations for problem in problems])
     hyper, effort = hyper or HyperPrior(), effort or Effort()
     if (factor := math.hypot(hyper.mean_std, hyper.spread)) > REACH:
