@@ -61,6 +61,9 @@ def inverse_plan(config: Config) -> DataPlan:
     if not (uncertain or config.initial_state or config.model_error):
         message = "no parameter has a prior, nor is there initial_state or model_error; nothing to estimate"
         raise ConfigError([config.document.fault(("parameters",), message)])
+    if "design" in config.document.data and not any(file.path.exists() for file in data_files(config.data).values()):
+        message = "no such file; an experiment that is still to come is for 'en4dvar design'"
+        raise ConfigError([config.document.fault(("data", "path"), message)])
     return config.data
 
 

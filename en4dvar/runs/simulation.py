@@ -31,7 +31,7 @@ from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory,
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
-from en4dvar.plumbing.hints import counted, listed
+from en4dvar.plumbing.hints import beside, counted, listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
@@ -86,6 +86,9 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     times = config.simulate_times if times is None else times
     observations = None
     for name, file in needed_file(config, times).items():
+        if times is None and not file.path.exists():
+            words = "give the instants instead: simulate.times in the file, or --times FROM:TO:STEP"
+            raise ConfigError(f"{file.path}: {beside(file.path)}; {words}")
         observations = read_observations(cast(DataPlan, config.data), file, name)
     if times is None:
         if observations is None:
