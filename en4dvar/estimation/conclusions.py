@@ -21,6 +21,7 @@ from en4dvar.ensemble.linalg import min_norm_fit
 from en4dvar.ensemble.members import InitialStates
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.hints import percent
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import Refined
@@ -232,7 +233,7 @@ def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:
     if withheld is None or not withheld.missed:
         return ()
     count = len(withheld.values)
-    words = f"of {count} readings after the window {withheld.inside:.0%} lie in their 90 % bands"
+    words = f"of {count} readings after the window {percent(withheld.inside)} lie in their 90 % bands"
     return (caution("future-missed", f"{words}: the estimate does not predict how the data continue"),)
 
 

@@ -15,7 +15,7 @@ from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
-from en4dvar.plumbing.hints import counted, listed
+from en4dvar.plumbing.hints import counted, listed, percent
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, PriorTerm
 
@@ -110,7 +110,7 @@ def structure(analysis: Analysis) -> Findings:
             f"the reading at {moments(analysis)[which]} {CLOCK} is farther off than the scatter of the residuals "
             f"explains (probability {_chance(probability)}); by its own error it is "
             f"{abs(residuals.studentised[place]):.1f} standard deviations off, with a leverage of "
-            f"{residuals.leverage[place]:.0%}"
+            f"{percent(residuals.leverage[place])}"
         )
         yield caution("odd-residuals", words)
 
@@ -227,7 +227,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
             share = float(np.mean(near & (outside | (sign * (after - bound) >= 0))))
             usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
-                words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
+                words = f"{percent(share)} of the posterior members of {parameter.name} pile up at its {side} bound"
                 yield caution("at-bound", f"{words} ({shown(bound, parameter)})", parameters=(parameter.name,))
 
 
