@@ -36,6 +36,7 @@ from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream
+from en4dvar.results.provenance import portable
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
@@ -283,7 +284,7 @@ def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> 
     noise = convert(plan.file.campaign.noise, seen.unit, seen.display_unit)
     comments = [
         f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
-        f"{command}; seed {plan.file.seed}",
+        f"{portable(command)}; seed {plan.file.seed}",
         f"{t.name} in {t.unit}, {v.name} in {v.unit}; noise std {noise:.9g} {v.unit}",
     ]
     return _commented(comments, [t, v], [dataset.times, dataset.values], ".5f")

@@ -110,6 +110,12 @@ def test_validate_tells_what_would_be_estimated(tmp_path: Path) -> None:
     assert not (Path("runs") / "toy").exists()
 
 
+def test_simulated_data_name_no_folder_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_toy(tmp_path)
+    monkeypatch.setattr("sys.argv", ["en4dvar", "simulate", str(path)])
+    assert call("simulate", path).stdout.splitlines()[0] == f"# en4dvar simulate {path.name}"
+
+
 def test_simulate_makes_data_that_can_be_read_back(tmp_path: Path) -> None:
     path = write_toy(tmp_path)
     out = tmp_path / "synthetic.csv"
