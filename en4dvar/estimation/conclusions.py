@@ -28,6 +28,7 @@ from en4dvar.sampling.refine import Refined
 from en4dvar.schemes.settings import AssimilationSettings
 
 LEAST = 1e-9  # variance of ln σ²
+RARE = 0.01  # chance of so few readings in their bands below which the estimate is not to be quoted
 ODDS = 20.0  # of residuals by one explanation against another, beyond which that is told
 
 
@@ -234,7 +235,9 @@ def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:
         return ()
     count = len(withheld.values)
     words = f"of {count} readings after the window {percent(withheld.inside)} lie in their 90 % bands"
-    return (caution("future-missed", f"{words}: the estimate does not predict how the data continue"),)
+    rare = f" (probability {withheld.chance:.1g} if it is right)" if withheld.chance < RARE else ""
+    words = f"{words}: the estimate does not predict how the data continue{rare}"
+    return (caution("future-missed", words, "serious" if rare else None),)
 
 
 def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:

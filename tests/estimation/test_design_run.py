@@ -312,7 +312,7 @@ def test_units_of_knobs_on_the_page_are_as_of_all_figures(tmp_path):
     assert "every 400000 µs" in page
     assert "every 400000 µs" in design_table(found)
     assert " us<" not in page
-    assert "en4dvar design …/plan.yaml" in page  # no folder of the machine
+    assert "en4dvar design plan.yaml" in page  # no folder of the machine
     assert with_pretty_unit("neo-hookean") == "neo-hookean"
     assert with_pretty_unit("0.3") == "0.3"
 

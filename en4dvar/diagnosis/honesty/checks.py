@@ -28,6 +28,7 @@ MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a pos
 SERIOUS: Severity = "serious"
 THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all members is there
 NOTHING = 0.5  # of the readings' own std: a discrepancy beyond it in nearly all members leaves little explained
+HARDLY = 0.1  # share of a variance: a shift of a third of the std, with which a 90 % interval holds the truth at 89 %
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
@@ -117,7 +118,7 @@ def structure(analysis: Analysis) -> Findings:
 
 def missed(analysis: Analysis) -> Findings:
     """A discrepancy that is there: what the residuals show of it widens the intervals, what parameters absorbed does
-    not. Serious where it is a large part of what there is to explain.
+    not. Serious where it is a large part of what there is to explain; a note where no estimate depends on it.
     """
     names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
     if amplitude is None or amplitude.name not in names:
@@ -136,7 +137,13 @@ def missed(analysis: Analysis) -> Findings:
     else:
         words = f"the model misses the readings {by}, beside errors of {shown(error, amplitude)}"
         absorbed = "the intervals allow for what shows in the residuals, not for what the parameters have absorbed"
-        yield caution("discrepancy-found", f"{words}: {absorbed}")
+        own = [j for j, name in enumerate(names) if name not in analysis.problem.of_errors]
+        share = max(analysis.discrepancy.shares[own, 1], default=1.0) if analysis.discrepancy and own else 1.0
+        if share < HARDLY:
+            words = f"{words}, which make up at most {percent(share)} of the variance of a parameter"
+            yield caution("discrepancy-found", words, "note")
+        else:
+            yield caution("discrepancy-found", f"{words}: {absorbed}")
 
 
 def moments(analysis: Analysis) -> list[str]:
