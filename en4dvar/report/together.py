@@ -320,6 +320,8 @@ class _Answer:
             f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
             "the share of its prior's variance that its data took away"
         )
+        if doubted := self.stored.doubted:
+            words += f", {' and '.join(doubted)} at a fraction of it, for warnings say that readings there are wrong"
         if centre.untrusted and self.stored.common:
             words += f". {self._in_parts(centre, of, std).removesuffix('.')}"
         return words
