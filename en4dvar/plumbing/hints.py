@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
@@ -64,6 +65,11 @@ def rounded(*counts: float) -> str:
     ('2600', '83000 to 1900000', '2600')
     """
     return " to ".join(dict.fromkeys(f"{float(f'{count:.2g}'):.0f}" for count in counts))
+
+
+def percent(share: float) -> str:
+    """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
+    return f"{100 * share:z.0f} %".replace("-", "−") if math.isfinite(share) else "–"
 
 
 def _meant(letters: str, known: Mapping[str, str]) -> list[str]:

@@ -32,11 +32,12 @@ from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory,
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
-from en4dvar.plumbing.hints import counted, listed
+from en4dvar.plumbing.hints import beside, counted, listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream
+from en4dvar.results.provenance import portable
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
@@ -88,6 +89,9 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     times = config.simulate_times if times is None else times
     observations = None
     for name, file in needed_file(config, times).items():
+        if times is None and not file.path.exists():
+            words = "give the instants instead: simulate.times in the file, or --times FROM:TO:STEP"
+            raise ConfigError(f"{file.path}: {beside(file.path)}; {words}")
         observations = read_observations(cast(DataPlan, config.data), file, name)
     if times is None:
         if observations is None:
@@ -288,7 +292,7 @@ def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> 
     )
     comments = [
         f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
-        f"{command}; seed {plan.file.seed}",
+        f"{portable(command)}; seed {plan.file.seed}",
         f"{t.name} in {t.unit}, {v.name} in {v.unit}; noise std {noise:.9g} {v.unit}",
     ]
     forms = [f".{max(5, THOUSANDTH - math.floor(math.log10(size)))}f" for size in (spacing, noise)]

@@ -101,6 +101,11 @@ def test_dataframe_is_one_row_a_member(result, analysis):
     np.testing.assert_array_equal(frame.to_numpy(), analysis.posterior)
 
 
+def test_the_history_holds_no_folders_of_the_machine():
+    command = "en4dvar run /home/me/gel.yaml --out '/home/me/my runs/gel'"
+    assert provenance("", command=command)["history"].split("Z ")[1].startswith("en4dvar run gel.yaml --out 'gel' (")
+
+
 def test_two_saves_hold_the_same_bits(result, analysis, tmp_path):
     first = load_result(result.save(tmp_path / "a.nc"))
     again = Result.from_analysis(analysis, provenance("other text"))

@@ -92,7 +92,7 @@ class Evaluated:
 def span_of_runs(
     planned: Planned, sizes: SampleSizes, method: Method, choice: bool = False, laws: int = 0
 ) -> tuple[int, int]:
-    """Forward runs of :func:`evaluate`, about, at least and at most."""
+    """Forward runs of :func:`evaluate`, about, at least and as a rule at most."""
     n, simulated = len(planned.names), min(sizes.simulated, sizes.draws)
     runs = sizes.draws + n + 1 if method == "linear" else sizes.draws * (n + 1)
     runs += (choice * sizes.draws + laws * sizes.simulated) * (n + 1)
@@ -100,7 +100,7 @@ def span_of_runs(
     if method == "nested":
         runs += simulated * (n + 1)
         integrals += simulated * (1 if planned.asked == n else 2)
-    least, most = span_of_rounds(integrals)
+    least, most = span_of_rounds(integrals, sizes.inner)
     return runs + least * sizes.inner, runs + most * sizes.inner
 
 

@@ -357,22 +357,24 @@ def population_from(
         theta=theta,
         belongs=estimated.belongs,
         odd_before=before,
-        empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
+        empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed, before),
         uncertain=float(estimated.uncertain.sum()),
         left_out=left_out,
     )
 
 
 def _empirical(
-    terms: Sequence[PriorTerm], members: Sequence[Array], likelihoods: Sequence[OwnLikelihood], seed: int
+    terms: Sequence[PriorTerm], members: Sequence[Array], likelihoods: Sequence[OwnLikelihood], seed: int, before: Array
 ) -> tuple[Empirical, ...]:
-    """The median over data sets of each parameter, from members (N_i, p) of each."""
+    """The median over data sets of each parameter, from members (N_i, p) of each, which are odd with the probability
+    ``before`` (S,): by what is known of them alone, for the check must not depend on the hierarchy."""
+    credible = (1 - before) / (1 - before.min())
     middle = np.array([np.median(z, axis=0) for z in members])
     std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
     slopes, logs = likelihoods[0].following.slopes, likelihoods[0].following.logs
     each = (Following(slopes[j : j + 1], logs[j : j + 1]) for j in range(len(terms)))
     pairs = zip(terms, middle.T, std.T, each, strict=True)
-    return tuple(empirical(term, m, s, following, seed) for term, m, s, following in pairs)
+    return tuple(empirical(term, m, s, following, seed, credible) for term, m, s, following in pairs)
 
 
 def _sets(
