@@ -40,10 +40,9 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     Raises :class:`ConfigError`: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
     :class:`DataError`: data files cannot be used; names every one of them.
     """
-    plan = inverse_plan(config)
     problems: list[InverseProblem] = []
     unusable: list[DataError] = []
-    for name, file in data_files(plan).items():
+    for name, file in estimated_files(config).items():
         try:
             problems.append(build_one(config, name, file))
         except DataError as error:
@@ -62,6 +61,17 @@ def inverse_plan(config: Config) -> DataPlan:
         message = "no parameter has a prior, nor is there initial_state or model_error; nothing to estimate"
         raise ConfigError([config.document.fault(("parameters",), message)])
     return config.data
+
+
+def estimated_files(config: Config) -> dict[str, DataFile]:
+    """The :func:`data_files` of an estimation. Raises :class:`ConfigError` where there is nothing to estimate, or the
+    experiment is only planned; :class:`DataError` as they do.
+    """
+    files = data_files(inverse_plan(config))
+    if "design" in config.document.data and not any(file.path.exists() for file in files.values()):
+        message = "no such file; an experiment that is still to come is for 'en4dvar design'"
+        raise ConfigError([config.document.fault(("data", "path"), message)])
+    return files
 
 
 def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:

@@ -3,7 +3,6 @@ with window, clock, errors, weights and places of each series.
 """
 
 import glob
-import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -28,7 +27,7 @@ from en4dvar.inputs.window import vertex
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import PathError, expanded, open_plain, readable
-from en4dvar.plumbing.hints import natural
+from en4dvar.plumbing.hints import free_name, natural
 from en4dvar.plumbing.units import convert
 
 LONGEST_HEAD = 4096  # bytes of a line of names
@@ -37,7 +36,9 @@ LONGEST_HEAD = 4096  # bytes of a line of names
 def with_parts(
     files: Mapping[str, Path], value: Column, layout: Layout = ANY, time: str | None = None
 ) -> dict[str, DataFile]:
-    """Every data set that the files hold, see :func:`~en4dvar.inputs.parts.parts_of`."""
+    """Every data set that the files hold, see :func:`~en4dvar.inputs.parts.parts_of`; a number tells apart those of one
+    name, as part ``2_3`` of ``a_1`` and part ``3`` of ``a_1_2`` have.
+    """
     by_name: dict[str, DataFile] = {}
     for name, path in files.items():
         try:
@@ -45,7 +46,7 @@ def with_parts(
         except DataError:  # told with its reason where it is read
             parts = ()
         for part in parts or ("",):
-            by_name[readable(f"{name}_{part}") if part else name] = DataFile(path, part)
+            by_name[free_name(readable(f"{name}_{part}") if part else name, by_name)] = DataFile(path, part)
     return by_name
 
 
@@ -115,9 +116,8 @@ def _unique_names(paths: list[Path], grouped: Set[Path]) -> list[str]:
     names: dict[str, None] = {}
     for path in paths:
         name = path.stem if stems[path.stem] == 1 and path not in grouped else f"{path.parent.name}_{path.stem}"
-        same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
-        names[next(n for n in same if n not in names)] = None
-    return list(map(readable, names))
+        names[free_name(readable(name), names)] = None
+    return list(names)
 
 
 def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = "sum") -> Observations:

@@ -165,7 +165,7 @@ class _Warnings:
             told = [entry for entry in told if self.sets == 1 or entry[2].severity == worst.severity]
             count, wholes = self.counts[worst.code, worst.severity], self.wholes.get(worst.code, [])
             if self.joint and not wholes and worst.severity != "serious":
-                begun.append(f"{worst.code} in {count}")
+                begun.append(f"{worst.name} in {count}")
                 continue
             if count + len(wholes) == 1:
                 yield from (f"{caution.kind}: {name}: {caution}" for _, _, caution in told)
@@ -174,7 +174,7 @@ class _Warnings:
             if count > MOST_NAMED:
                 which[0] = f"{count} of {self.sets} data sets, worst {which[0]}"
             who = " and ".join(", ".join(names) for names in (wholes, which) if names)
-            yield f"{worst.kind}: {who}: {worst if count == 1 else f'{worst.code}; {worst.advice}'}"
+            yield f"{worst.kind}: {who}: {worst if count == 1 else f'{worst.name}; {worst.advice}'}"
         if begun:
             codes = ", ".join(begun)
             yield f"note: the fits of the {self.sets} single data sets only begin the joint estimate: {codes}"

@@ -37,6 +37,7 @@ def simulate(
     from en4dvar.config.document import override, read_document
     from en4dvar.config.kinds import resolve_campaign
     from en4dvar.plumbing.files import inside
+    from en4dvar.results.provenance import portable
     from en4dvar.runs.simulation import draw_campaign, noise_level, parse_times, simulate, to_csv, write_campaign
 
     others = asked(forms)
@@ -69,7 +70,7 @@ def simulate(
     simulation = simulate(config, instants)
     if noise:
         simulation = simulation.with_noise(noise_level(noise, config, simulation), seed)
-    deliver(to_csv(simulation, config, command_line()), out, "")
+    deliver(to_csv(simulation, config, portable(command_line())), out, "")
 
 
 @click.command()

@@ -8,7 +8,7 @@ from en4dvar.config.design import time_grid
 from en4dvar.config.document import Document, Source, document_from
 from en4dvar.config.kinds import SequenceConfig, TwinConfig, resolve_sequence, resolve_twin
 from en4dvar.config.load import Config, load_config, resolve
-from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.errors import ConfigError
 
 __all__ = [
     "AnyConfig", "Config", "SequenceConfig", "TwinConfig", "load_any", "load_config", "load_sequence", "load_twin",
@@ -33,18 +33,12 @@ def resolve_any(document: Document, base: Path) -> AnyConfig:
 
 def load_twin(source: Source, overrides: Mapping[str, Any] | None = None) -> TwinConfig:
     """The counterpart of :func:`load_config` for a twin experiment. Raises :class:`ConfigError`."""
-    return _of_kind(TwinConfig, load_any(source, overrides), "not a twin experiment: it has no twin: section")
+    return resolve_twin(*document_from(source, overrides))
 
 
 def load_sequence(source: Source, overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
     """The counterpart of :func:`load_config` for a sequence. Raises :class:`ConfigError`."""
-    return _of_kind(SequenceConfig, load_any(source, overrides), "not a sequence: it has no sequence: section")
-
-
-def _of_kind(kind: type[Loaded], config: AnyConfig, otherwise: str) -> Loaded:
-    if not isinstance(config, kind):
-        raise ConfigError([Fault(otherwise, file=config.document.file)])
-    return config
+    return resolve_sequence(*document_from(source, overrides))
 
 
 def loaded(config: Loaded | Source, load: Callable[..., Loaded], overrides: Mapping[str, Any] | None) -> Loaded:

@@ -20,7 +20,7 @@ import yaml
 from en4dvar.inputs.formats import SUFFIXES
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import brief, shown
+from en4dvar.plumbing.hints import brief, listed, shown
 from en4dvar.plumbing.units import UnitError
 
 Key = tuple[str | int, ...]
@@ -215,7 +215,8 @@ def override(
 def _propose(what: str, path: Path) -> str:
     shell_path = shlex.quote(str(path))
     proposal = f"'en4dvar init --data {shell_path}' looks at the readings and proposes one"
-    return f"{path}: {what}, not a configuration; {proposal}"
+    held = sorted(file.name for file in path.glob("*.yaml"))  # as the directory of a run does
+    return f"{path}: {what}, not a configuration; {f'it holds {listed(held, 5)}' if held else proposal}"
 
 
 class _Refused(Exception):

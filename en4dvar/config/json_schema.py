@@ -3,7 +3,8 @@
 An editor that reads it completes and checks keys while one types; the words are the descriptions of the settings. It
 accepts every file that loads, but cannot tell everything that loading tells (units that do not fit, files that are not
 there). What depends on packages comes from them: the settings of each registered model (group ``en4dvar.models``) and
-further kinds of files (group ``en4dvar.schemas``: the key that marks the kind → pydantic model of the whole file).
+further kinds of files (group ``en4dvar.schemas``: the key that marks the kind → pydantic model of the whole file,
+whose ``PURPOSE`` says what it is and which command it is for).
 """
 
 import json
@@ -16,7 +17,7 @@ from typing import Any
 from en4dvar.config.context import TEXT
 from en4dvar.config.data import SeriesData
 from en4dvar.config.kinds import CampaignFile, SequenceFile, TwinFile
-from en4dvar.config.load import Estimation
+from en4dvar.config.load import OTHERS, Estimation
 from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
 from en4dvar.model.state import OF_READINGS, Parameter
@@ -25,7 +26,6 @@ from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.user_code import loading
 
 Json = dict[str, Any]
-KINDS = "en4dvar.schemas"
 
 
 def json_schema() -> Json:
@@ -49,7 +49,7 @@ def json_schema() -> Json:
             for model in models
         ]  # fmt: skip
     kinds = {name: name for name in marked}
-    for name, entry in installed(KINDS).items():
+    for name, entry in installed(OTHERS).items():
         with suppress(ConfigError), loading(f"schema {name!r}"):  # another package's may not end the command
             definitions[f"{name}_file"] = _of(entry.load().model_json_schema())
             kinds[name] = f"{name}_file"

@@ -22,11 +22,17 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.priors.dependence import Dependence
 from en4dvar.schemes.settings import AssimilationSettings
 
-KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
+KINDS = {  # the section that marks a file of another kind than an estimation → what it is, and what it is for
+    "twin": "a twin experiment, for 'en4dvar run' and 'en4dvar sweep-twin'",
+    "sequence": "a sequence, for 'en4dvar run'",
+    "campaign": "a synthetic campaign, for 'en4dvar simulate'",
+}
+OTHERS = "en4dvar.schemas"  # entry points: the section that marks a kind of file → pydantic model of the whole file
 
 
 class Simulate(Section):
@@ -131,9 +137,6 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`. ``model``: one that is
     there already; the ``model:`` section then only records what it is.
     """
-    for kind, words in KINDS.items():
-        if kind in document.data:
-            raise ConfigError([document.fault((kind,), f"{words}: it can be run and validated", at_key=True)])
     read = read_file(Estimation, document, base, model)
     file = read.file
     own = {p.name for p in read.model.parameters}
@@ -194,8 +197,24 @@ class Read(Generic[S]):
         return {**said, "execution": file.execution, "resolved": resolved}
 
 
+def require_kind(schema: type[Section], document: Document) -> None:
+    """Raise :class:`ConfigError` where a file is of another kind than that of the ``schema``: what is it for?"""
+    others = installed(OTHERS)
+    marks = [*KINDS, *others]
+    own, written = ([mark for mark in marks if mark in keys] for keys in (schema.model_fields, document.data))
+    if set(own) & set(written) or not (own or written):
+        return
+    if written:
+        mark = written[0]
+        purpose = KINDS.get(mark) or getattr(others[mark].load(), "PURPOSE", "a file of another kind")
+        raise ConfigError([document.fault((mark,), f"it makes the file {purpose}", at_key=True)])
+    commands = " and ".join(["'en4dvar run'", *["'en4dvar design'"] * ("design" in document.data)])
+    raise ConfigError([document.fault((own[0],), f"required, but not given; without it the file is for {commands}")])
+
+
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:
     """Validate a document for a ``model``, by default its own. Raises :class:`ConfigError`: every fault, in order."""
+    require_kind(kind, document)
     faults: list[Fault] = []
     section = document.data.get("model")
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)

@@ -21,12 +21,14 @@ from en4dvar.ensemble.linalg import min_norm_fit
 from en4dvar.ensemble.members import InitialStates
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.hints import percent
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import Refined
 from en4dvar.schemes.settings import AssimilationSettings
 
 LEAST = 1e-9  # variance of ln σ²
+RARE = 0.01  # chance of so few readings in their bands below which the estimate is not to be quoted
 ODDS = 20.0  # of residuals by one explanation against another, beyond which that is told
 
 
@@ -232,8 +234,10 @@ def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:
     if withheld is None or not withheld.missed:
         return ()
     count = len(withheld.values)
-    words = f"of {count} readings after the window {withheld.inside:.0%} lie in their 90 % bands"
-    return (caution("future-missed", f"{words}: the estimate does not predict how the data continue"),)
+    words = f"of {count} readings after the window {percent(withheld.inside)} lie in their 90 % bands"
+    rare = f" (probability {withheld.chance:.1g} if it is right)" if withheld.chance < RARE else ""
+    words = f"{words}: the estimate does not predict how the data continue{rare}"
+    return (caution("future-missed", words, "serious" if rare else None),)
 
 
 def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:

@@ -17,7 +17,7 @@ from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift, exclusion, is_manifold
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
-from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.hints import counted, percent
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
 
@@ -110,7 +110,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
         lines.insert(0, change_words(names, a.log_evidence_change))
     if a.withheld is not None:
         share, count = a.withheld.inside, len(a.withheld.values)
-        lines.insert(0, f"after the window: {share:.0%} of {count} readings lie in their 90 % bands")
+        lines.insert(0, f"after the window: {percent(share)} of {count} readings lie in their 90 % bands")
     known = [name for name in a.problem.model.path_parameters if name in a.problem.prior.names]
     if a.settings.what_if == "added":
         rows = counted(sum(shift.settled for shift in a.what_if), "row")

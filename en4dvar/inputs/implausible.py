@@ -239,6 +239,7 @@ def _off(frames: Array) -> Array:
     return np.abs(frames - np.maximum(np.rint(frames), 1))
 
 
+APART = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
 SEVERAL = 4  # readings: a series has as many, and two of them as many each while both go on
 
 
@@ -262,7 +263,7 @@ def check_order(
     apart += bool(lines) * ", or a column that says whose each row is, and name it by data.by"
     ends = np.flatnonzero(np.diff(times) < 0)
     if bounds and times[after] == times[before]:
-        hint = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
+        hint = APART
     elif column := _telling_apart(path, layout, kept, lines, wanted, times):
         name = column if column.isidentifier() else repr(column)
         hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"

@@ -13,7 +13,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import check_order, cut_off, level_top, outlying, placeholders, scatter_of, step_doubts
+from en4dvar.inputs.implausible import (
+    APART,
+    check_order,
+    cut_off,
+    level_top,
+    outlying,
+    placeholders,
+    scatter_of,
+    step_doubts,
+)
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
@@ -171,6 +180,8 @@ def read_series(
     if not repeats and len(each) < len(times):  # readings of one time as their mean, their errors as independent
         for c in errors:
             own = stated[c.name]
+            if c.kind == "mark" and np.any(np.bincount(which, own)[counts > 1]):
+                raise DataError(f"{path}: a bound is not averaged with another reading of its time; {APART}")
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values, rows = each, np.bincount(which, values) / counts, None

@@ -96,6 +96,7 @@ def cells_of(line: Line, delimiter: str) -> list[str]:
 
 class Table:
     """Columns of a text file or a sheet: their ``names``, and ``rows`` of cells with the numbers of their lines.
+    ``every`` one tells the decimal sign, whatever of them is taken for ``rows`` later.
 
     ``lines`` are numbered lines, of a sheet the cells of each. The names stand in the first line that has all of
     ``wanted`` (names, or patterns with ``*``), else in the one above the numbers; where none does, the columns are
@@ -121,6 +122,7 @@ class Table:
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
                 below.append(self.rows.pop(0)[1])
+        self.every = self.rows
         self.names = [f"c{i + 1}" for i in range(len(self.rows[0][1]))] if top is None else head[top]
         beside = (*below, *(head[top - 1 : top] if top else ()))
         units = next((cells for cells in beside if _are_units(cells, self.names)), ())
@@ -140,7 +142,7 @@ class Table:
 
     def numbers(self, i: int, name: str) -> Array:
         """A column as numbers. Raises :class:`DataError`."""
-        cells = self._cells(i)
+        cells = self._cells(self.rows, i)
         signs = self._decimal_signs(i)
         if len(signs) > 1 and (unsure := next((k for k, cell in enumerate(cells) if is_open(cell)), None)) is not None:
             words = "decimals or thousands? other numbers have decimal points, and others commas; write one of the two"
@@ -157,16 +159,16 @@ class Table:
 
     def unsure(self, i: int) -> str:
         """A number of a column whose comma is that of decimals by ``decimal`` alone; "" where there is none."""
-        unsure = next((cell for cell in self._cells(i) if "," in cell and is_open(cell)), "")
+        unsure = next((cell for cell in self._cells(self.rows, i) if "," in cell and is_open(cell)), "")
         return "" if self._decimal_signs(i) else unsure
 
-    def _cells(self, i: int) -> list[str]:
-        return [closed_up(row[i]) if i < len(row) else "" for _, row in self.rows]
+    def _cells(self, rows: Sequence[tuple[int, Sequence[str]]], i: int) -> list[str]:
+        return [closed_up(row[i]) if i < len(row) else "" for _, row in rows]
 
     def _decimal_signs(self, i: int) -> set[Decimal]:
         """What the numbers of a column tell, else those of all columns."""
-        every = (signs_of(self._cells(k)) for k in range(len(self.names)))
-        return signs_of(self._cells(i)) or set[Decimal]().union(*every)
+        columns = (signs_of(self._cells(self.every, k)) for k in range(len(self.names)))
+        return signs_of(self._cells(self.every, i)) or set[Decimal]().union(*columns)
 
     def _below(self, k: int, i: int) -> str:
         """What to do where row ``k`` repeats the names, ends the numbers of column ``i``, or is words between them."""

@@ -27,7 +27,7 @@ import numpy as np
 from en4dvar.data.extrema import minima, with_unseen
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.hints import shown
+from en4dvar.plumbing.hints import percent, shown
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
 _NUMBERED = re.compile(r"(minimum|trough)(?:\s+(\d+))?")
@@ -128,7 +128,7 @@ def index_of(
             level = f"{100 * instant.share:.3g} % of maximum"
             elsewhere = f"give another instant or a time, or write '{level} or end'"
             raise DataError(f"asks for {level}, but no reading after the maximum is below that; {elsewhere}")
-        few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
+        few = f"only {len(indices)} minima with a prominence of {percent(prominence)} of the range follow its start"
         elsewhere = f"'to: {instant.kind} {instant.number} or end', or at a time"
         advice = f"end it elsewhere ({elsewhere}), or lower its prominence"
         raise DataError(f"asks for minimum {instant.number}, but {few}; {advice}")

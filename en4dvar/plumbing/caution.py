@@ -13,6 +13,8 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # the worst first
 _SAID = tomllib.loads(Path(__file__).with_name("cautions.toml").read_text(encoding="utf-8"))
 CATALOGUE: dict[str, tuple[Severity, str]] = {code: (of["severity"], of["advice"]) for code, of in _SAID.items()}
 """Code → severity and what to do, those of a severity by what they do to the numbers, the worst first."""
+ABOUT = {code: of["about"] for code, of in _SAID.items()}
+"""What each is about in a few words, where there is no place for its finding."""
 TRIGGERS = {code: of["trigger"] for code, of in _SAID.items()}
 """When each is given, for the reference."""
 SPOILS = {"non-gaussian", "at-bound"}  # mean ± std, though they are not serious; what is serious does in any case
@@ -39,6 +41,11 @@ class Caution:
     def kind(self) -> str:
         """The word for it on a terminal: ``note``, or ``warning``."""
         return "note" if self.severity == "note" else "warning"
+
+    @property
+    def name(self) -> str:
+        """Its code and what it is about, of several data sets."""
+        return f"{self.code} ({ABOUT[self.code]})" if self.code in ABOUT else self.code
 
     @property
     def line(self) -> str:

@@ -1,6 +1,8 @@
 """Suggestions for misspelt names and missing files."""
 
 import functools
+import itertools
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
@@ -65,6 +67,11 @@ def rounded(*counts: float) -> str:
     return " to ".join(dict.fromkeys(f"{float(f'{count:.2g}'):.0f}" for count in counts))
 
 
+def percent(share: float) -> str:
+    """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
+    return f"{100 * share:z.0f} %".replace("-", "−") if math.isfinite(share) else "–"
+
+
 def _meant(letters: str, known: Mapping[str, str]) -> list[str]:
     """The few names that begin with ``letters``, else those that hold them, else those whose meaning does."""
     if not 2 < len(letters) < LONGEST:
@@ -93,6 +100,16 @@ def numbered(name: str) -> list[str | int]:
     ['bubble2', 'bubble10']
     """
     return [int(s) if i % 2 else s for i, s in enumerate(re.split(r"([0-9]{1,40})", name))]
+
+
+def free_name(name: str, others: Collection[str]) -> str:
+    """The name, with a number behind it where one of ``others`` is the same.
+
+    >>> free_name("gel", []), free_name("gel", ["gel", "gel_2"])
+    ('gel', 'gel_3')
+    """
+    same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+    return next(it for it in same if it not in others)
 
 
 def nearest(name: str, others: Collection[str]) -> str:

@@ -26,7 +26,8 @@ from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
-from en4dvar.report.text import figure_text
+from en4dvar.report.text import figure_text, plain_number
+from en4dvar.results.declared import NAMES, Names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +38,7 @@ FIT, ERRORS = "fit", "errors"  # J_o, half the sum of squares of the readings: a
 LEVELS = (0.05, 0.25, 0.75, 0.95)
 LONGEST = 1_000_000_000  # bytes of the table
 NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z", "rank")
-COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "members", "cautions", "failure")
+COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "members", "cautions", "failure", "symbol")
 
 
 @dataclass(frozen=True)
@@ -57,20 +58,22 @@ class Judged:
     failure: str = ""
 
 
-def write_sets(path: Path, quantities: Sequence[tuple[str, str]], sets: Sequence[Judged]) -> Path:
-    """Write the table of quantities (name, unit). Raises :class:`OutputError`."""
+def write_sets(path: Path, quantities: Sequence[tuple[str, str, str]], sets: Sequence[Judged]) -> Path:
+    """Write the table of quantities (name, unit, symbol). Raises :class:`OutputError`."""
     lines: list[Sequence[object]] = [COLUMNS]
     for judged in sets:
         head, tail = (judged.number, judged.data_set), (judged.members, " ".join(judged.cautions), "")
         if judged.failure:
-            lines.append([*head, *[""] * (len(COLUMNS) - 3), judged.failure])
+            lines.append([*head, *[""] * (len(COLUMNS) - 4), judged.failure, ""])
         of_each = zip(quantities, judged.numbers.tolist(), strict=not judged.failure)
-        lines += [[*head, *quantity, *numbers, *tail] for quantity, numbers in of_each]
+        lines += [[*head, name, unit, *numbers, *tail, symbol] for (name, unit, symbol), numbers in of_each]
     return write_csv(path, lines)
 
 
-def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ...]]:
-    """The quantities (name, unit) and the sets of a table. Raises :class:`OutputError` where it is none."""
+def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ...], Names]:
+    """The quantities (name, unit), the sets of a table, and how names are written. Raises :class:`OutputError` where it
+    is none.
+    """
     try:
         by_set: dict[int, list[dict[str, str]]] = {}
         for line in csv.DictReader(io.StringIO(read_text(path, LONGEST))):
@@ -78,13 +81,14 @@ def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ..
         sets = tuple(_set(number, lines) for number, lines in by_set.items())
         known = next((lines for lines in by_set.values() if not lines[0]["failure"]), [])
         quantities = tuple((line["quantity"], line["unit"]) for line in known)
+        written = Names((line["quantity"], symbol) for line in known if (symbol := line.get("symbol")))
         if not sets or any(not s.failure and len(s.numbers) != len(quantities) for s in sets):
             raise ValueError
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from None
     except (KeyError, TypeError, ValueError, csv.Error):
         raise OutputError(f"{path}: not a table of 'en4dvar calibrate', or damaged; conduct it again") from None
-    return quantities, sets
+    return quantities, sets, written
 
 
 def _set(number: int, lines: Sequence[dict[str, str]]) -> Judged:
@@ -125,6 +129,10 @@ class Verdict:
     @property
     def words(self) -> str:
         """What is wrong, in a sentence; "" where nothing is seen."""
+        return self.said()
+
+    def said(self, written: Names = NAMES) -> str:
+        """:attr:`words`, with the quantity as ``written``."""
         if not self.off:
             return ""
         if self.quantity == ERRORS:
@@ -140,7 +148,7 @@ class Verdict:
             too.append("intervals hold the truth too rarely")
         elif any(low > stated for (low, _), stated in shares):
             too.append("intervals hold the truth too often")
-        return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"
+        return f"{written[self.quantity]}: {' and '.join(too) or 'the shape of the posterior is off'}"
 
 
 @dataclass(frozen=True)
@@ -151,6 +159,8 @@ class Calibration:
     quantities: tuple[tuple[str, str], ...]
     sets: tuple[Judged, ...]
     directory: Path
+    written: Names = field(default_factory=Names)
+    """How a page writes a quantity."""
 
     @property
     def good(self) -> list[Judged]:
@@ -172,14 +182,18 @@ class Calibration:
     @property
     def remarks(self) -> list[str]:
         """What is to be known beside the table: what is off, what failed, what was doubted."""
-        told = [verdict.words for verdict in self.verdicts if verdict.off]
+        return self.said()
+
+    def said(self, written: Names = NAMES) -> list[str]:
+        """:attr:`remarks`, with quantities as ``written``."""
+        told = [verdict.said(written) for verdict in self.verdicts if verdict.off]
         if self.good and not told:
             told = [f"{len(self.good)} sets show no sign that the posterior is not calibrated"]
         for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
             count = sum(judged.failure == reason for judged in self.sets)
             told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
         told_of = {verdict.quantity for verdict in self.verdicts}
-        if self.good and (absent := [name for name, _ in self.quantities if name not in told_of]):
+        if self.good and (absent := [written[name] for name, _ in self.quantities if name not in told_of]):
             told.append(f"no ranks of {', '.join(absent)}: what made the readings has no such value")
         counts = Counter(code for judged in self.good for code in judged.cautions)
         of = f"of {len(self.good)} sets have the serious warning"
@@ -245,7 +259,8 @@ def curves(calibration: Calibration) -> Chart:
     for verdict in calibration.verdicts:
         uniform = calibration.uniform(j := names.index(verdict.quantity))
         x, (low, high) = uniform.shares, uniform.band
-        title = f"{figure_text(verdict.quantity)}: p = {verdict.p:.2g}"
+        name = calibration.written.get(verdict.quantity) or figure_text(verdict.quantity)
+        title = f"{name}: p = {plain_number(verdict.p, 2)}"
         panel = Panel("rank of the truth, 0 to 1", "difference of shares", title=title, xlim=(0.0, 1.0))
         panel.band(x, low - x, high - x, "prior", 0.25)
         panel.rule(0.0)
@@ -264,9 +279,9 @@ def write_calibration(folder: Path) -> Path:
 
 def load_calibration(folder: Path) -> Calibration:
     """What ``calibration.csv`` of a folder says. Raises :class:`OutputError`."""
-    quantities, sets = read_sets(folder / "calibration.csv")
+    quantities, sets, written = read_sets(folder / "calibration.csv")
     named = re.search(r"^name: *(.+)$", _configuration(folder), re.MULTILINE)
-    return Calibration(named[1] if named else folder.resolve().name, quantities, sets, folder)
+    return Calibration(named[1] if named else folder.resolve().name, quantities, sets, folder, written)
 
 
 def _configuration(folder: Path) -> str:

@@ -11,12 +11,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
-from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.hints import counted, percent
 from en4dvar.report import responses, text
 from en4dvar.report.chart import DARK, LIGHT
 
 WRITERS = (  # what templates call
-    text.display_unit, text.estimate, text.fixed, text.in_powers, text.number_like, text.percent, text.plain_number,
+    text.display_unit, text.estimate, text.fixed, text.in_powers, text.number_like, percent, text.plain_number,
     text.plus_minus, text.pretty_unit, text.quantity, text.range_words, text.rough_number, text.shown, text.symbol_html,
     text.untrusted_words, responses.sentence, responses.shift_text, counted,
 )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 from en4dvar.diagnosis.diagnostics import change_words, chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
-from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
+from en4dvar.plumbing.caution import ABOUT, Caution, codes, gravity, worst_first
 from en4dvar.report import responses
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.figures import all_figures, neighbours, stored_walks
@@ -251,7 +251,7 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     for c, name in every:
         first.setdefault((c.severity, c.code), (c, name))
     return [
-        {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
-         "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}
+        {"severity": c.severity, "code": c.code, "about": ABOUT.get(c.code), "count": count[c.severity, c.code],
+         "advice": c.advice, "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}
         for c in worst_first(tuple(c for c, _ in first.values()))
     ]  # fmt: skip

@@ -23,7 +23,7 @@ from scipy.stats import binom
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, write_text
-from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.hints import counted, percent
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, interval, stacked
@@ -32,7 +32,7 @@ from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_m
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import axis_label, fixed, number_like, percent, plain_number, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.declared import Names
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import MEAN, estimates, series_file, series_group

@@ -48,13 +48,15 @@ def pretty_unit(unit: str) -> str:
     return re.sub(r"\s*\*\s*|\s+", "·", text)
 
 
-def with_micro(words: object) -> str:
-    """``"at 18.2 us"`` → ``"at 18.2 µs"``, as the tables of a page write it.
+def with_micro(words: object) -> Markup:
+    """``"at 18.2 us"`` → ``"at 18.2 µs"``, as the tables of a page write it, and powers of e with their exponent above;
+    everything else is escaped text.
 
-    >>> with_micro("1.4 um in 2 uses, 5 us")
-    '1.4 µm in 2 uses, 5 µs'
+    >>> print(with_micro("1.4 um in 2 uses, 5 us, e^12.4 times < 1"))
+    1.4 µm in 2 uses, 5 µs, e<sup>12.4</sup> times &lt; 1
     """
-    return re.sub(r"(?<=\d )u\w+\b", lambda m: pretty_unit(m[0]) if is_unit(m[0]) else m[0], str(words))
+    text = re.sub(r"(?<=\d )u\w+\b", lambda m: pretty_unit(m[0]) if is_unit(m[0]) else m[0], str(words))
+    return Markup(re.sub(r"\be\^([\d.]*\d)", r"e<sup>\1</sup>", str(escape(text))))
 
 
 def unit_behind(unit: str) -> str:
@@ -175,11 +177,6 @@ def signed(value: float) -> str:
     ('+0.23', '−4')
     """
     return ("+" if value > 0 else "") + plain_number(value, 2)
-
-
-def percent(share: float) -> str:
-    """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
-    return f"{100 * share:z.0f} %".replace("-", "−") if math.isfinite(share) else "–"
 
 
 def fixed(value: float, places: int) -> str:

@@ -16,6 +16,7 @@ from en4dvar.estimation.population.hierarchy import named
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results_table, summary_rows
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.hints import percent
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report import text
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
@@ -278,7 +279,7 @@ class _Answer:
         draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
         logarithmic = _logarithmic(draws[0])
         if logarithmic:
-            low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
+            low, middle, high = map(percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
             spread = f"{middle} ({low} … {high})"
         geometric = logarithmic and stored.headline == "median"
         what = "median (geometric mean)" if geometric else stored.headline
@@ -319,6 +320,8 @@ class _Answer:
             f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
             "the share of its prior's variance that its data took away"
         )
+        if doubted := self.stored.doubted:
+            words += f", {' and '.join(doubted)} at a fraction of it, for warnings say that readings there are wrong"
         if centre.untrusted and self.stored.common:
             words += f". {self._in_parts(centre, of, std).removesuffix('.')}"
         return words
@@ -331,7 +334,7 @@ class _Answer:
             return f"The data determine a combination of {names} better than each of them."
         powers = ((self.names[name], text.quantity(exponent, 0.1)) for name, exponent in parts.items())
         product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-        return f"The data determine {product}, to {text.percent(combination.std)}, better than {names}."
+        return f"The data determine {product}, to {percent(combination.std)}, better than {names}."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:

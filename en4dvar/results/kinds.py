@@ -1,5 +1,6 @@
 """The kinds of runs, and of which one a finished run is."""
 
+import shlex
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -61,6 +62,9 @@ def require_result(folder: Path) -> None:
 
 def lines_of_list(work: Path) -> tuple[str, ...]:
     """The list of ``work`` as it is written. Raises :class:`OutputError`."""
+    if work.is_file():
+        of = f"; 'en4dvar run {shlex.quote(str(work))}' makes one" if work.suffix in (".yaml", ".yml") else ""
+        raise OutputError(f"{work}: a file, not the directory of a run{of}")
     listing = inside(work, LISTING)
     try:
         with open_plain(listing) as file:

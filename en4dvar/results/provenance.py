@@ -9,6 +9,7 @@ import functools
 import inspect
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -41,7 +42,7 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
     versions = package_versions(PACKAGES)
     return {
         "date_created": now,
-        "history": f"{now} {command or 'en4dvar'} (en4dvar {versions.get('en4dvar', 'unknown')})",
+        "history": f"{now} {portable(command) or 'en4dvar'} (en4dvar {versions.get('en4dvar', 'unknown')})",
         "institution": os.environ.get("EN4DVAR_INSTITUTION", ""),
         "configuration": config_text,
         "configuration_file": Path(config_path).name if config_path else "",
@@ -52,6 +53,21 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpu": f"{cpu_model()}, {os.cpu_count()} logical cores",
     }
+
+
+def portable(command: str) -> str:
+    """A command as a file holds it that others get: of paths that begin at the root of this machine the names alone.
+
+    >>> portable("en4dvar run /home/me/gel.yaml --data '/home/my films/*.csv' --set a.path=/data/x/y.csv")
+    "en4dvar run gel.yaml --data '*.csv' --set a.path=y.csv"
+    >>> portable("en4dvar run ../gel.yaml --scheduler tcp://10.0.0.1:8786 --set a=/tmp")
+    'en4dvar run ../gel.yaml --scheduler tcp://10.0.0.1:8786 --set a=/tmp'
+    """
+    return _WORD.sub(lambda word: _FOLDERS.sub("", word[0]), command)
+
+
+_WORD = re.compile(r"'[^']*'|[^\s']+")
+_FOLDERS = re.compile(r"(?<![^\s=\[,'])(?:[A-Za-z]:)?[\\/](?:[^\\/,']+[\\/])+(?=[^\\/])")
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:

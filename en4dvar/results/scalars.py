@@ -54,11 +54,12 @@ def _thresholds(a: Analysis) -> dict[str, float]:
 
 
 def _nrmse(a: Analysis, predicted: Array) -> float:
-    """Of several series, in units of their own, from the mean of (1 − NRMSE)² over those that vary."""
-    if not a.observations.parts:
-        return nrmse(a.observations.values, predicted)
-    y = a.observations.values
-    each = [nrmse(y[p.where], predicted[p.where]) for p in a.problem.parts if np.ptp(y[p.where]) > 0]
+    """Of readings that count; of several series, in units of their own, from the mean of (1 − NRMSE)² over those that
+    vary.
+    """
+    y, used = a.observations.values, a.observations.used
+    of_parts = [used[(p.begin <= used) & (used < p.end)] for p in a.problem.parts]
+    each = [nrmse(y[k], predicted[k]) for k in of_parts if len(k) and np.ptp(y[k]) > 0]
     return float(1 - np.sqrt(np.mean((1 - np.array(each)) ** 2))) if each else np.nan
 
 

@@ -127,9 +127,10 @@ def _state_read(observable: Observable, model: ForwardModel) -> str:
 
 
 def _states_shown(r: SeriesResult) -> list[Shown]:
-    """What says how each variable of the state is shown: a parameter, the observable that reads it, or its name."""
+    """What says how each variable of the state is shown: the observable that reads it, a parameter, its field of the
+    state, or its name."""
     model = r.problem.start.model
-    known: dict[str, Shown] = {p.name: p for p in model.parameters}
+    known: dict[str, Shown] = {shown.name: shown for shown in (*model.layout.fields, *model.parameters)}
     known |= {_state_read(o, model): o for o in _columns(r)}
     return [known.get(name) or Field(name, unit=unit) for name, unit in _states(r)]
 

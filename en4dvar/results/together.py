@@ -14,11 +14,12 @@ import numpy as np
 
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.joint.estimate import JointEstimate
+from en4dvar.estimation.joint.problem import EVERYONE, JointProblem
 from en4dvar.estimation.population.campaign import Combination, Draws, Population
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed, worst_first
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.hints import natural
+from en4dvar.plumbing.hints import free_name, natural
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
@@ -48,15 +49,15 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
         "effective_draws": estimate.members.effective,
         "warnings": _lines(estimate.cautions),
     }
-    prior, of_each, called = {}, {}, variable_names(estimate)
+    prior, of_each, of_shared = {}, {}, shared_names(estimate.joint)
     for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True):
         own = [m if of.get(key[0]) == key[1] else None for m, of in zip(alone, estimate.joint.groups, strict=True)]
-        of_each[called[key]] = _alone(term.parameter, estimate.joint.experiments, own)
+        of_each[of_shared[key]] = _alone(term.parameter, estimate.joint.experiments, own)
         quantiles = term.to_physical(term.mean + term.std * np.array([-1.6448536, 0.0, 1.6448536]))
-        prior[called[key]] = variable("quantile", quantiles, term.parameter.unit, "prior")
+        prior[of_shared[key]] = variable("quantile", quantiles, term.parameter.unit, "prior")
     groups = {
         "/": Group(attrs=root),
-        "/posterior": Group(_shared(estimate, called) | _own(estimate, names, called), datasets),
+        "/posterior": Group(_shared(estimate, of_shared) | _own(estimate, names, of_shared), datasets),
         "/prior": Group(prior),
         "/alone": Group(of_each, datasets),
         "/fit": Group(_fit(estimate, names), datasets),
@@ -64,7 +65,7 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
     if estimate.without:
         rest, kept = estimate.rest, list(estimate.rest.joint.names)
         others, warned = {"dataset": variable("dataset", text(kept), "", "data set")}, _lines(rest.cautions)
-        groups["/without"] = Group(_shared(rest, called) | _own(rest, kept, called), others, {"warnings": warned})
+        groups["/without"] = Group(_shared(rest, of_shared) | _own(rest, kept, of_shared), others, {"warnings": warned})
     return to_bytes(groups).write(path)
 
 
@@ -72,25 +73,15 @@ def _lines(cautions: Sequence[Caution]) -> str:
     return "\n".join(c.line for c in worst_first(cautions))
 
 
-Called = Mapping[tuple[str, str | None], str]
-
-
-def variable_names(estimate: JointEstimate) -> Called:
-    """Variable of each quantity: of a shared one (name, group) its name, and its group where that is not everyone; of
-    one that data sets have of their own (name, None) its name. One that is taken gets ``_own`` or ``_`` behind it.
+def shared_names(joint: JointProblem) -> dict[tuple[str, str], str]:
+    """Variable of each shared quantity: its name, and its group where that is not everyone; a number tells apart groups
+    that differ in signs alone.
     """
-    joint, called = estimate.joint, dict[tuple[str, str | None], str]()
-    for name, group in joint.shared:
+    names: dict[tuple[str, str], str] = {}
+    for name, group in sorted(joint.shared, key=lambda key: key[1] != EVERYONE):
         plain = "".join(c if c.isalnum() else "_" for c in group)
-        called[name, group] = _free(f"{name}_{plain}" if plain else name, called)
-    each = zip(joint.experiments, joint.groups, strict=True)
-    for name in dict.fromkeys(name for e, shared in each for name in e.prior.names if name not in shared):
-        called[name, None] = _free(f"{name}_own" if name in called.values() else name, called)
-    return called
-
-
-def _free(name: str, called: Called) -> str:
-    return _free(f"{name}_", called) if name in called.values() else name
+        names[name, group] = free_name(f"{name}_{plain}" if plain else name, names.values())
+    return names
 
 
 def of_parameter(p: Parameter, dims: str | tuple[str, ...], values: Any, words: str = "", **more: Any) -> Variable:
@@ -98,12 +89,12 @@ def of_parameter(p: Parameter, dims: str | tuple[str, ...], values: Any, words: 
     return variable(dims, values, p.unit, words or p.label, symbol=p.symbol, display_units=p.display_unit, **more)
 
 
-def _shared(estimate: JointEstimate, called: Called) -> dict[str, Variable]:
+def _shared(estimate: JointEstimate, names: Mapping[tuple[str, str], str]) -> dict[str, Variable]:
     variables = {}
     for j, (key, term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
         label = ", ".join(filter(None, (term.parameter.label, key[1])))
         members, mode = estimate.shared[None, :, j], float(estimate.shared_mode[j])
-        variables[called[key]] = of_parameter(term.parameter, DRAWS, members, label, mode=mode)
+        variables[names[key]] = of_parameter(term.parameter, DRAWS, members, label, mode=mode)
     return variables
 
 
@@ -116,7 +107,7 @@ def _alone(p: Parameter, problems: Sequence[InverseProblem], alone: Sequence[Arr
     return variable(("dataset", "quantile"), rows, p.unit, "5, 50 and 95 % of a data set alone")
 
 
-def _own(estimate: JointEstimate, names: Sequence[str], called: Called) -> dict[str, Variable]:
+def _own(estimate: JointEstimate, names: Sequence[str], shared: Mapping[tuple[str, str], str]) -> dict[str, Variable]:
     """(chain, draw, dataset) of the parameters that data sets have of their own, NaN where one has it not."""
     count = len(estimate.members.border)
     values: dict[str, Array] = {}
@@ -127,8 +118,10 @@ def _own(estimate: JointEstimate, names: Sequence[str], called: Called) -> dict[
             p = experiment.prior.parameters[j]
             values.setdefault(p.name, np.full((1, count, len(names)), np.nan))[0, :, e] = members[:, j]
             parameters[p.name] = p
+    taken = set(shared.values())
     return {
-        called[name, None]: of_parameter(parameters[name], (*DRAWS, "dataset"), array) for name, array in values.items()
+        f"{name}_own" if name in taken else name: of_parameter(parameters[name], (*DRAWS, "dataset"), array)
+        for name, array in values.items()
     }
 
 

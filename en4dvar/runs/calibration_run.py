@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from en4dvar.assembly.build import build_one, data_files, inverse_plan
+from en4dvar.assembly.build import build_one, estimated_files
 from en4dvar.config import Config, load_config, resolve
 from en4dvar.config.document import document_from, override
 from en4dvar.diagnosis.diagnostics import member_quantiles
@@ -102,7 +102,7 @@ class CalibrationKind(RunKind[Calibration]):
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:
-        return data_files(inverse_plan(self.config))
+        return estimated_files(self.config)
 
     def check(self) -> None:
         for name, file in self.data.items():
@@ -127,7 +127,8 @@ class CalibrationKind(RunKind[Calibration]):
         require_some("sets", [judged.failure for judged in told])
         name, file = next(iter(self.data.items()))
         estimated = build_one(self.config, name, file).prior.parameters
-        quantities = [*((p.name, p.display_unit or p.unit) for p in estimated), (FIT, "1"), (ERRORS, "1")]
+        quantities = [(p.name, p.display_unit or p.unit, p.symbol) for p in estimated]
+        quantities += [(name, "1", "") for name in (FIT, ERRORS)]
         write_sets(run.directory.at(self.result), quantities, told)
         return replace(load_calibration(run.directory.work), directory=self.config.directory)
 

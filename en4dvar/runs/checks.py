@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import create_model
 
-from en4dvar.assembly.build import build_one, build_sequence, data_files, inverse_plan
+from en4dvar.assembly.build import build_one, build_sequence, data_files, estimated_files, inverse_plan
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
 from en4dvar.config.context import check
@@ -47,8 +47,9 @@ def check_all(
     faults, problems, unusable = list[Fault](), list[InverseProblem](), list[Fault]()
     with _collecting(faults, document):
         if isinstance(config, Config):
+            files = estimated_files(config)
             problems, unusable = _read_files(document, inverse_plan(config), partial(checked_problem, config))
-            require_counted_once(config, data_files(inverse_plan(config)))
+            require_counted_once(config, files)
         if isinstance(config, SequenceConfig):
             build_sequence(config)
     if faults or (unusable and not problems):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.errors import ConfigError, OutputError, retold
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import free_name, listed
 from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
@@ -116,14 +115,11 @@ def _kept_draws(problem: InverseProblem, result: StoredResult) -> OwnDraws | Non
 
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
-    taken, seen = {s.name for s in sets}, set[str]()
+    names: dict[str, None] = {}
     for s in sets:
-        if (name := s.name) in seen:
-            name = next(other for n in count(2) if (other := f"{s.name}_{n}") not in taken)
-            s = replace(s, problem=replace(s.problem, observations=replace(s.problem.observations, name=name)))
-        taken.add(name)
-        seen.add(name)
-        yield s
+        names[name := free_name(s.name, names)] = None
+        observations = replace(s.problem.observations, name=name)
+        yield replace(s, problem=replace(s.problem, observations=observations))
 
 
 def sampled_evidences(run_dir: Path, workers: int | None, trust: bool, tell: Callable[[str], None]) -> dict[str, float]:

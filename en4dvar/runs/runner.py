@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.assembly.build import data_files, inverse_plan
+from en4dvar.assembly.build import estimated_files
 from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
@@ -52,7 +52,7 @@ def run(
     TooFewMembersError: the ensemble is lost. ExecutorError: the workers are gone. Interrupted: Ctrl-C or SIGTERM.
     """
     config = loaded(config, load_config, overrides)
-    count = len(data_files(inverse_plan(config)))
+    count = len(estimated_files(config))
     if count != 1:
         raise ConfigError(f"data.path names {count} data sets; use run_campaign, or name one")
     (result,) = run_campaign(config, force=force, resume=resume, progress=progress, command=command)
@@ -107,7 +107,7 @@ class EstimateKind(RunKind[Campaign]):
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:
-        return data_files(inverse_plan(self.config))
+        return estimated_files(self.config)
 
     def check(self) -> None:
         """Raise what is wrong with the data files where none can be used, one is in no group, or one counts twice."""

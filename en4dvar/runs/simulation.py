@@ -32,14 +32,16 @@ from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory,
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
-from en4dvar.plumbing.hints import counted, listed
+from en4dvar.plumbing.hints import beside, counted, listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream
+from en4dvar.results.provenance import portable
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
+THOUSANDTH = 3  # decimals, of the noise and of the time between readings, that numbers in files have at least
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,9 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     times = config.simulate_times if times is None else times
     observations = None
     for name, file in needed_file(config, times).items():
+        if times is None and not file.path.exists():
+            words = "give the instants instead: simulate.times in the file, or --times FROM:TO:STEP"
+            raise ConfigError(f"{file.path}: {beside(file.path)}; {words}")
         observations = read_observations(cast(DataPlan, config.data), file, name)
     if times is None:
         if observations is None:
@@ -192,13 +197,14 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}".removesuffix(" 1") for name, v in simulation.theta.items())
     columns = [time, *columns]
     comments = [*comment.splitlines(), f"parameters: {truth}", ", ".join(f"{c.name} in {c.unit}" for c in columns)]
-    return _commented(comments, columns, [simulation.times, *simulation.series.values()], [".9g"] * len(columns))
+    values = [simulation.times, *simulation.series.values()]
+    return _commented(comments, columns, values, [".9g"] * len(columns))
 
 
 def _commented(
     comments: Sequence[str], columns: Sequence[Column], values: Sequence[Array], forms: Sequence[str]
 ) -> str:
-    """Values (K,) of each column in its unit, written in its form, as CSV below comments and names."""
+    """Values (K,) of each column in its unit, each written in its form, as CSV below comments and names."""
     written = (convert(v, column.target, column.unit) for column, v in zip(columns, values, strict=True))
     rows = (",".join(map(format, row, forms)) for row in zip(*written, strict=True))
     return "\n".join([*(f"# {line}" for line in comments), ",".join(c.name for c in columns), *rows]) + "\n"
@@ -280,19 +286,17 @@ def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> 
     model, seen = plan.model, plan.model.observables[0]
     t = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     v = Column(f"{seen.symbol.strip('$')}_{seen.display_unit}", seen.display_unit, seen.unit)
-    noise = convert(plan.file.campaign.noise, seen.unit, seen.display_unit)
-    gap = convert(plan.file.campaign.spacing[0], t.target, t.unit)
+    noise, spacing = (
+        convert(size, c.target, c.unit)
+        for size, c in ((plan.file.campaign.noise, v), (plan.file.campaign.spacing[0], t))
+    )
     comments = [
         f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
-        f"{command}; seed {plan.file.seed}",
+        f"{portable(command)}; seed {plan.file.seed}",
         f"{t.name} in {t.unit}, {v.name} in {v.unit}; noise std {noise:.9g} {v.unit}",
     ]
-    return _commented(comments, [t, v], [dataset.times, dataset.values], [_decimals(gap), _decimals(noise)])
-
-
-def _decimals(least: float) -> str:
-    """The form of numbers whose differences are not smaller than ``least``: to a thousandth of that or better."""
-    return f".{max(5, 4 - math.floor(math.log10(least)))}f"
+    forms = [f".{max(5, THOUSANDTH - math.floor(math.log10(size)))}f" for size in (spacing, noise)]
+    return _commented(comments, [t, v], [dataset.times, dataset.values], forms)
 
 
 def truth_csv(plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...]) -> str:

@@ -8,7 +8,7 @@ predictions costs microseconds: of it tens of thousands of draws can be made, wh
 10 to 60 % of them stay effective under the model. The emulator is fitted to all runs made so far, and learns where it
 is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyond the runs before them. The more runs
 there are, the higher is the degree of its polynomials: with quadratic ones a valley that turns by a right angle, as of
-a stiffness and a stiffening that stand for each other, lost a third of its probability.
+a stiffness and a stiffening that stand for each other, lost up to a third of its probability.
 
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """

@@ -78,8 +78,9 @@ class WeightedDraws:
 
         ``exact``: nearly of the moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
         """
-        vectors = np.linalg.eigh(self.covariance)[1]
-        order = np.lexsort(((self.x - self.mean) @ vectors[:, -1], self.mode))
+        std = np.sqrt(np.diag(self.covariance)) + np.finfo(float).tiny  # over these, units do not matter
+        vectors = np.linalg.eigh(self.covariance / np.outer(std, std))[1]
+        order = np.lexsort(((self.x - self.mean) / std @ vectors[:, -1], self.mode))
         if not exact:
             return np.asarray(self.x[order[resampled(self.shares[order], count, stream)]])
         pool = order[resampled(self.shares[order], max(POOL * count, LEAST), stream)]

@@ -58,15 +58,20 @@ class Targets:
 def targets(
     observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf, most: float = np.inf
 ) -> Targets:
-    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
+    """The grid covers every reading that counts at every shift within ±``shift`` (s), from ``earliest`` on.
 
-    Raises ValueError: a reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
+    Raises ValueError: readings that count are all alike; one would be compared before ``earliest``; the grid would have
+    more than ``most`` instants.
     """
     reach = int(np.floor(shift / step * (1 + 1e-9)))
-    first = min(float(o.times[0]) for o in observations) - reach * step
-    last = max(float(o.times[-1]) for o in observations) + reach * step
+    each = [(o.times[o.used], o.values[o.used]) for o in observations]
+    for o, (_, y) in zip(observations, each, strict=True):
+        if not len(y) or np.ptp(y) == 0:
+            raise ValueError(f"{o.name}: a fit by NRMSE needs readings, no bounds, with a weight that differ")
+    first = min(float(t[0]) for t, _ in each) - reach * step
+    last = max(float(t[-1]) for t, _ in each) + reach * step
     if (count := (last - first) / step) > most:
-        apart = np.median(np.concatenate([np.diff(o.times) for o in observations]))
+        apart = np.median(np.concatenate([np.diff(t) for t, _ in each]))
         raise ValueError(
             f"from {first:g} to {last:g} in steps of {step:g} are {count:.2g} instants, more than memory is meant for "
             f"({most:.2g}): readings are {apart:g} apart, give a larger --step, and a --shift that fits it"
@@ -74,10 +79,10 @@ def targets(
     if first < earliest:
         raise ValueError(f"a reading shifted by {-reach * step:g} s would lie {earliest - first:g} s before the start")
     grid = first + step * np.arange(int(np.ceil((last - first) / step * (1 - 1e-9))) + 1)
-    values = np.concatenate([o.values for o in observations])
-    nearest = np.concatenate([np.rint((o.times - first) / step).astype(np.int64) for o in observations])
-    offsets = np.concatenate([[0], np.cumsum([len(o) for o in observations])])
-    scale = np.array([np.sum((o.values - o.values.mean()) ** 2) for o in observations])
+    values = np.concatenate([y for _, y in each])
+    nearest = np.concatenate([np.rint((t - first) / step).astype(np.int64) for t, _ in each])
+    offsets = np.concatenate([[0], np.cumsum([len(y) for _, y in each])])
+    scale = np.array([np.sum((y - y.mean()) ** 2) for _, y in each])
     return Targets(np.asarray(grid, dtype=float), step, values, nearest, offsets, scale, reach)
 
 
@@ -203,8 +208,9 @@ def run_sweep(
     with the trajectories done and to do. ``earliest``: the instant before which the model has no path; −inf where
     it has one at any time.
 
-    Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's.
-    DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step is far too small.
+    Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's;
+    one has several series. DataError: no trajectory fits a set; readings are all alike, or one would be compared before
+    ``earliest``; the step is far too small.
     """
     executor = executor or SerialExecutor()
     mean, std = _moments(problems)
@@ -272,6 +278,8 @@ def _searched(problem: InverseProblem) -> InverseProblem:
 def _moments(problems: Sequence[InverseProblem]) -> tuple[Array, Array]:
     """Mean and std (S, n) of the priors, transformed. Raises :class:`ConfigError`: they cannot share a design."""
     first = problems[0]
+    if several := [p.observations.name for p in problems if p.observations.parts]:
+        raise ConfigError(f"{several[0]}: a sweep fits data sets of one series, read at no places of a field")
     for other in problems[1:]:
         if other.model is not first.model or _in_common(other) != _in_common(first):
             raise ConfigError(

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from en4dvar.assembly.build import build, data_files, inverse_plan
+from en4dvar.assembly.build import build, estimated_files
 from en4dvar.config import Config
 from en4dvar.config.document import yaml_text
 from en4dvar.estimation.assimilate import assimilate
@@ -100,7 +100,7 @@ def identity_of(seed: int, sweep: SweepSettings, configs: Mapping[str, Config]) 
     each: dict[str, dict[str, Any]] = {}
     data: list[tuple[str, str]] = []
     for name, config in configs.items():
-        own = identity(config.resolved, config.model, data_files(inverse_plan(config)))
+        own = identity(config.resolved, config.model, estimated_files(config))
         each[name] = yaml.safe_load(own.settings)
         for key, values in common.items():
             values.update(each[name].pop(key))

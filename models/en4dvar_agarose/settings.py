@@ -3,13 +3,14 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from en4dvar.config import Config, load_config
 from en4dvar.config.context import check
 from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.load import require_kind
 from en4dvar.config.schema import Name, Section
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.units import Quantity
@@ -39,6 +40,7 @@ class Sweep(Section):
 class StudySchema(Section):
     """The whole file of ``en4dvar study``."""
 
+    PURPOSE: ClassVar[str] = "a study, for 'en4dvar study'"
     name: Name
     """Name of the study; its results go to runs/<name>."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
@@ -81,6 +83,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
     """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""
     path = Path(path)
     document = override(read_document(path), overrides or {})
+    require_kind(StudySchema, document)
     faults: list[Fault] = []
     top = check(StudySchema, document.data, (), document, faults)
     if top is None:

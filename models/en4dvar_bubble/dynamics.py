@@ -279,14 +279,14 @@ class Dynamics:
         system, above_zero = self.system, (0.0, np.inf)
         least_pressure = 0.0 if "p_v" in self.named else self.medium.p_v
         state = (
-            Field("R", unit="m", bounds=above_zero),
-            Field("Rdot", unit="m/s"),
-            Field("p_b", unit="Pa", bounds=(least_pressure, np.inf)),
-            Field("S", unit="Pa"),
-            Field("T", system.gas + system.wall, "K", above_zero),
-            Field("C", system.vapour + system.kinetic, "1", (0.0, 1.0)),
-            Field("T_m", system.medium, "K", above_zero),
-            Field("Z", system.memory, "Pa"),
+            Field("R", unit="m", bounds=above_zero, symbol="$R$"),
+            Field("Rdot", unit="m/s", symbol="$Ṙ$"),
+            Field("p_b", unit="Pa", bounds=(least_pressure, np.inf), symbol=r"$p_{\mathrm{b}}$", display_unit="kPa"),
+            Field("S", unit="Pa", symbol="$S$", display_unit="kPa"),
+            Field("T", system.gas + system.wall, "K", above_zero, symbol="$T$"),
+            Field("C", system.vapour + system.kinetic, "1", (0.0, 1.0), symbol="$C$"),
+            Field("T_m", system.medium, "K", above_zero, symbol=r"$T_{\mathrm{m}}$"),
+            Field("Z", system.memory, "Pa", symbol="$Z$", display_unit="kPa"),
             *(Field(p.name, unit=p.unit) for p in self.parameters),
         )
         return StateLayout(tuple(block for block in state if block.size))

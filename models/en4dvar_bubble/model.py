@@ -59,7 +59,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     batch = 8
     compiled = True
     observables = (
-        Observable("radius", "m", StateField("R", rate_of="Rdot"), "R", "um", "bubble radius", positive=True),
+        Observable("radius", "m", StateField("R", rate_of="Rdot"), "$R$", "um", "bubble radius", positive=True),
         *OBSERVABLES,
     )
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import percent
 from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import SHARP, fit_outline, two_edges
 from en4dvar_movie.frames import Frame, saturated
@@ -108,9 +109,9 @@ def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:
     if outline.circle.R < LEAST_RADIUS:
         return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
     if outline.seen < LEAST_SEEN:
-        return f"cut: {outline.seen:.0%} of the outline lies in the frame"
+        return f"cut: {percent(outline.seen)} of the outline lies in the frame"
     if outline.seen < 0.9 and outline.width > max(MOST_BLUR * outline.circle.R, SHARP * optics.width):
-        return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
+        return f"cut and blurred: {percent(outline.seen)} of the outline lies in the frame, and it is no edge"
     if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
         return "the brightness next to the outline is not that of a bubble"
     if outline.contrast > 0.25 * optics.contrast:

@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Array, Indices
+from en4dvar.plumbing.hints import percent
 from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
@@ -172,7 +173,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.joined:
         words = "nested circles too close to be told apart: their mean"
     elif outline.seen < 0.9:
-        words = f"{outline.seen:.0%} of the outline lies in the frame"
+        words = f"{percent(outline.seen)} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
     light, beside, wide = outline.rim or (0.0, 0.0, 0.0)
     blurred = np.hypot(outline.width, wide)

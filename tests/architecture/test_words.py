@@ -101,3 +101,9 @@ def test_a_class_name_has_one_meaning():
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
+def test_shares_are_written_in_one_way():
+    """As ``percent`` writes them, with a space before the sign: no format of Python's, which has none."""
+    bare = re.compile(r":[\d.]*%\}")
+    assert [str(p.relative_to(ROOT)) for p in FILES if bare.search(p.read_text(encoding="utf-8"))] == []

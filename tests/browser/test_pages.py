@@ -118,6 +118,26 @@ def test_the_table_of_a_campaign_of_five_parameters_fits_a_screen(opened, pages)
     assert opened(pages["campaign"], width=1200).page.evaluate(script) == [12, 0]
 
 
+def test_the_table_of_a_campaign_of_twelve_parameters_fits_a_screen(opened, pages, tmp_path):
+    """Those that ``init`` proposes for a bubble; mean and spread stand below each other, and ± with the spread."""
+    one = SetSummary.of(load_stored(pages["campaign"].parent / PACK / "a"), "a")
+    row = next(iter(one.rows.values()))
+    numbers = {
+        "kPa": (2.6, 1.2), "Pa s": (0.0156, 0.0097), "um": (20.4, 1.1), "nm": (238.8, 1.5), "kg/m^3": (1029, 18),
+        "m/s": (1525, 20), "MPa": (101.26, 0.94), "us": (0.64, 0.22), "1": (0.416, 0.097), "K": (0.9992, 0.0047),
+        "mm": (1.46, 0.52), "ms": (4.9, 1.4),
+    }  # fmt: skip
+    rows = [replace(row, name=unit, mean=mean, std=std, unit=unit) for unit, (mean, std) in numbers.items()]
+    sets = [replace(one, name=f"PolyAcry_12_4{i}", rows={row.name: row for row in rows}) for i in range(3)]
+    path = tmp_path / "report.html"
+    path.write_text(render_overview(sets, pages={}, failures={}, headlines=(), figures=[]), encoding="utf-8")
+    page = opened(path, width=1200).page
+    scroll = page.locator("table.campaign").locator("..")
+    needed, there = scroll.evaluate("e => [e.scrollWidth, e.clientWidth]")
+    assert needed <= there
+    assert "± " not in page.locator("table.campaign tbody").inner_text()
+
+
 @pytest.mark.parametrize("width", [360, 700, 960, 1100, 1200])
 def test_the_table_of_parameters_fits_a_screen_with_long_values(opened, pages, width):
     script = """() => {

@@ -110,6 +110,12 @@ def test_validate_tells_what_would_be_estimated(tmp_path: Path) -> None:
     assert not (Path("runs") / "toy").exists()
 
 
+def test_simulated_data_name_no_folder_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_toy(tmp_path)
+    monkeypatch.setattr("sys.argv", ["en4dvar", "simulate", str(path)])
+    assert call("simulate", path).stdout.splitlines()[0] == f"# en4dvar simulate {path.name}"
+
+
 def test_simulate_makes_data_that_can_be_read_back(tmp_path: Path) -> None:
     path = write_toy(tmp_path)
     out = tmp_path / "synthetic.csv"
@@ -279,8 +285,12 @@ def test_warnings_of_a_campaign_are_counted_by_kind(tmp_path: Path, capsys: pyte
     assert told.out.splitlines()[1].split() == ["k", "N/m", "40", "40", "3", "3", "3"]
     lines = told.err.splitlines()
     assert lines[0].startswith("warning: set7: stopped; raise assimilation.max_iterations")
-    assert lines[1].startswith("warning: 40 of 40 data sets, worst set7, set0, set1: misfit; look at")
-    assert lines[2].startswith("note: 40 of 40 data sets, worst set7, set0, set1: not-informed; ")
+    assert lines[1].startswith(
+        "warning: 40 of 40 data sets, worst set7, set0, set1: misfit (residuals are larger than the errors explain); l"
+    )
+    assert lines[2].startswith(
+        "note: 40 of 40 data sets, worst set7, set0, set1: not-informed (a parameter is known from its prior alone); "
+    )
     assert lines[3:] == ["what was found in each of them: run.log and the report"]
     _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
@@ -294,9 +304,12 @@ def test_warnings_of_fits_that_only_begin_a_joint_estimate_are_one_line() -> Non
         told.add(f"set{n}", [caution("non-gaussian", "bent"), caution("not-informed", "k"), caution("misfit", "χ²")])
     told.add("all together", [caution("not-informed", "c")], whole=True)
     serious, of_both, begun, _ = told.lines()
-    assert serious.startswith("warning: 6 of 6 data sets, worst set0, set1, set2: misfit; ")
-    assert of_both.startswith("note: all together and 6 of 6 data sets, worst set0, set1, set2: not-informed; ")
-    assert begun == "note: the fits of the 6 single data sets only begin the joint estimate: non-gaussian in 6"
+    assert serious.startswith(
+        "warning: 6 of 6 data sets, worst set0, set1, set2: misfit (residuals are larger than the errors explain); "
+    )
+    assert of_both.startswith("note: all together and 6 of 6 data sets, worst set0, set1, set2: not-informed (a ")
+    whole = "non-gaussian (mean ± std describe the posterior badly) in 6"
+    assert begun == f"note: the fits of the 6 single data sets only begin the joint estimate: {whole}"
 
 
 def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
@@ -309,8 +322,11 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
             f"the population of {gel}", [caution("misfit", "in a"), caution("chain-not-converged", gel)], whole=True
         )
     lines = "\n".join(told.lines())
-    assert "the population of a, the population of b and 4 of 6 data sets, worst set0, set1, set2: misfit; " in lines
-    assert "the population of a, the population of b: chain-not-converged; " in lines
+    assert (
+        "the population of a, the population of b and 4 of 6 data sets, worst set0, set1, set2: misfit (residuals"
+        in lines
+    )
+    assert "the population of a, the population of b: chain-not-converged (the Markov chains disagree); " in lines
     one = _Warnings()
     one.add("set1", [])
     one.add("set2", [caution("lost-frame", "after the reading at 2 s")])

@@ -19,7 +19,7 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-STEPS = "runner.data_files", "runner.checked_problem", "engine.choose_executor"
+STEPS = "runner.estimated_files", "runner.checked_problem", "engine.choose_executor"
 EARLY = tuple(f"en4dvar.runs.{step}" for step in STEPS)
 BEGUN = (
     *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),

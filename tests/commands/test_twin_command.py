@@ -207,10 +207,10 @@ def test_localisation_needs_one_observed_field(tmp_path):
 
 def test_other_commands_and_functions_say_what_it_is(tmp_path):
     path = write(tmp_path)
-    with pytest.raises(ConfigError, match=r"twin\.yaml:4:1: twin: a twin experiment: it can be run and validated"):
+    with pytest.raises(ConfigError, match=r"twin\.yaml:4:1: twin: it makes the file a twin experiment, for"):
         load_config(path)
     assert call("simulate", path).exit_code == 2
     plain = tmp_path / "plain.yaml"
     plain.write_text("name: a\nmodel: {name: lorenz96}\nparameters: {F: 8}\n")
-    with pytest.raises(ConfigError, match="no twin: section"):
+    with pytest.raises(ConfigError, match="twin: required, but not given; without it the file is for 'en4dvar run'"):
         load_twin(plain)

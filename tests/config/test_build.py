@@ -9,8 +9,10 @@ from scipy.io import savemat
 from toy_config import csv_text, write_toy
 
 from en4dvar.assembly.build import build, data_files, inverse_plan
+from en4dvar.assembly.reading import with_parts
 from en4dvar.cli import main
 from en4dvar.config import load_config
+from en4dvar.inputs.parts import Column, Layout
 from en4dvar.plumbing.errors import ConfigError, DataError
 
 
@@ -211,6 +213,19 @@ def test_rows_that_say_which_data_set(tmp_path: Path) -> None:
         (tmp_path / "toy.csv").write_text(f"bubble,t_ms,x_um\n{rows}{text}")
         with pytest.raises(DataError, match=message):
             build(load_config(path, {"data.by": by}))
+
+
+def test_data_sets_of_several_files_have_names_of_their_own(tmp_path):
+    """Part ``2_3`` of one and part ``3`` of the other: neither takes the place of the other."""
+    text = "t,gel,R\n" + "".join(f"{k},{{}},{k + 1}\n" for k in range(3))
+    paths = {name: tmp_path / f"{name}.csv" for name in ("a_1", "a_1_2")}
+    for path, part in zip(paths.values(), ("2_3", "3"), strict=True):
+        path.write_text(text.replace("{}", part))
+    found = with_parts(paths, Column("R", "um", "um"), Layout(by="gel"))
+    assert [(name, file.path.stem, file.part) for name, file in found.items()] == [
+        ("a_1_2_3", "a_1", "2_3"),
+        ("a_1_2_3_2", "a_1_2", "3"),
+    ]
 
 
 def test_outliers_that_were_left_out_are_told(tmp_path):

@@ -72,8 +72,11 @@ def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
     (tmp_path / "quickstart.yaml").write_text("a: 1\n")
     with pytest.raises(ConfigError, match=r"no such file; the folder holds quickstart\.yaml"):
         read_document(tmp_path / "quikstart.yaml")
-    with pytest.raises(ConfigError, match="a folder, not a configuration; 'en4dvar init --data"):
+    with pytest.raises(ConfigError, match=r"a folder, not a configuration; it holds quickstart\.yaml"):
         read_document(tmp_path)
+    (tmp_path / "data").mkdir()
+    with pytest.raises(ConfigError, match="a folder, not a configuration; 'en4dvar init --data"):
+        read_document(tmp_path / "data")
     (tmp_path / "latin.yaml").write_bytes(b"a: \xb5m\n")
     with pytest.raises(ConfigError, match="not UTF-8"):
         read_document(tmp_path / "latin.yaml")

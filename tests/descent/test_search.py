@@ -341,7 +341,8 @@ def test_nothing_is_looked_for_where_the_readings_after_the_window_are_as_expect
 def test_a_future_that_no_minimum_expects_is_told():
     analysis = assimilate(parted(off=30.0), AssimilationSettings(), 1)
     told = {c.code: c for c in analysis.cautions}["future-missed"]
-    assert "of 8 readings after the window 0% lie" in told.words
+    assert "of 8 readings after the window 0 % lie" in told.words
+    assert (told.severity == "serious") == (analysis.withheld.chance < 0.01) == ("probability" in told.words)
 
 
 @pytest.mark.slow

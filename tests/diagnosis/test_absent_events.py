@@ -40,7 +40,7 @@ def test_the_terminal_counts_what_is_serious(joint):
         lost = [caution("members-lost", "1 of 9", "caution"), caution("members-lost", "9 of 9", "serious")]
         warnings.add(f"set{i}", lost if i in (1, 3) else lost[:1])
     line = next(warnings.lines())
-    assert line.startswith("warning: set1, set3: members-lost; ")
+    assert line.startswith("warning: set1, set3: members-lost (the model failed for some members); ")
     for i in range(5, 9):
         warnings.add(f"set{i}", lost)
-    assert next(warnings.lines()).startswith("warning: 6 of 9 data sets, worst set1, set3, set5: members-lost; ")
+    assert next(warnings.lines()).startswith("warning: 6 of 9 data sets, worst set1, set3, set5: members-lost (")

@@ -288,6 +288,17 @@ def test_a_discrepancy_as_large_as_the_signal_leaves_nothing_to_quote(height, se
     assert ("check units" in told.advice) == (severity == "serious")
 
 
+@pytest.mark.parametrize(("share", "severity"), [(0.09, "note"), (0.11, "caution")])
+def test_a_discrepancy_on_which_no_estimate_depends_is_a_note(share, severity):
+    """Of rows that say where the variance of a parameter comes from, those of the errors themselves do not count."""
+    analysis = run(waved(3.0))
+    shares = np.tile([1 - share, share, 0.0], (len(analysis.parameters), 1))
+    shares[2:] = 0.0, 1.0, 0.0  # amplitude and length
+    (told,) = missed(replace(analysis, discrepancy=replace(analysis.discrepancy, shares=shares)))
+    assert told.severity == severity
+    assert ("at most 9 % of the variance" in told.words) == (severity == "note")
+
+
 def test_a_discrepancy_is_measured_by_the_errors_of_the_readings_not_by_what_it_makes_of_them():
     analysis = run(waved(3.0))
     np.testing.assert_allclose(analysis.own_std, 0.05, rtol=1e-12)

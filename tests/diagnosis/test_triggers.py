@@ -6,7 +6,7 @@ import pytest
 from diagnosis.provoked import PROVOKED, chain_not_converged
 from diagnosis.provoked_by_several import OF_SEVERAL
 
-from en4dvar.plumbing.caution import CATALOGUE, SEVERITIES, TRIGGERS, Caution, caution
+from en4dvar.plumbing.caution import ABOUT, CATALOGUE, SEVERITIES, TRIGGERS, Caution, caution
 from en4dvar.sampling import mcmc
 
 
@@ -27,7 +27,7 @@ def test_chain_that_has_not_mixed(monkeypatch):
 
 
 def test_every_code_has_its_test():
-    assert set(CATALOGUE) == set(TRIGGERS) == {*PROVOKED, *OF_SEVERAL, "chain-not-converged"}
+    assert set(CATALOGUE) == set(ABOUT) == set(TRIGGERS) == {*PROVOKED, *OF_SEVERAL, "chain-not-converged"}
 
 
 @pytest.mark.parametrize("words", ["plain", "ends — like advice", "two\nlines [misfit] — of it", "<b> & 'quotes' …"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from toys import Vectorised, make_observations
 
+from en4dvar.data.series import Part, Places
 from en4dvar.estimation.joint import estimate_jointly, sharing
 from en4dvar.estimation.joint.agreement import DIFFER, trends
 from en4dvar.estimation.joint.members import sampled
@@ -167,3 +168,16 @@ def test_trends_by_chance_are_rare():
     rng, problems = np.random.default_rng(3), campaign([0.0] * 8)
     told = [list(trends(problems, rng.standard_normal((8, 2)), ["a", "b"])) for _ in range(100)]
     assert sum(map(bool, told)) <= 4  # of one in a hundred
+
+
+def test_a_trend_is_one_with_readings_that_count():
+    """Of weight 0 one is the larger, the larger the value; and a field that is read at one instant has no steps."""
+    values, problems = np.array([[3.0], [1], [7], [5], [2], [8], [4], [6]]), campaign([0.0] * 8)
+    for e, (value,) in enumerate(values):
+        o = problems[e].observations
+        far = replace(o, values=np.append(1e3 * value, o.values[1:]), weights=np.append(0.0, o.weights[1:]))
+        problems[e] = replace(problems[e], observations=far)
+    assert not list(trends(problems, values, ["a"]))
+    at_once = Part("a", problems[0].observable, 0, 2, Places.at_indices([0, 1]))
+    o = replace(make_observations([1.0, 2.0], [0.0, 1.0]), times=np.ones(2), parts=(at_once,))
+    assert not list(trends([*problems[:-1], replace(problems[-1], observations=o)], values, ["a"]))

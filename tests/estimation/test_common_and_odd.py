@@ -290,7 +290,7 @@ def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain(
     theta, own = rng.standard_normal((400, 1)), 0.01 * rng.standard_normal((count, 400, 1))
     likelihoods = [OwnLikelihood(None, None, Following(np.array([[0.5]]), np.zeros(1)), z) for z in own]
     sets = [0.9 * (0.5 * theta + z) for z in own]
-    (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1)
+    (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1, np.zeros(len(sets)))
     assert median.common == pytest.approx(0.5, rel=1e-6)
     assert 0.8 * 0.01 / np.sqrt(count) < median.between < 4 * 0.01 / np.sqrt(count)
 
@@ -317,6 +317,13 @@ def test_one_draw_that_has_all_the_weight_is_told_as_too_few(monkeypatch):
     found = population_of(problems, members(problems), ["a"], 2, kept=known(problems, None), hyper=HYPER, effort=ROUGH)
     assert found.size < 1.01
     assert "chain-not-converged" in {c.code for c in _cautions(found)}
+
+
+def test_two_data_sets_of_one_name_would_have_the_same_random_numbers():
+    problems = campaign(truths(0.2))
+    problems[1] = replace(problems[1], observations=replace(problems[1].observations, name="set2"))
+    with pytest.raises(ConfigError, match="a population need different names: set2 twice"):
+        population_of(problems, members(problems), ["a"], 2)
 
 
 def test_parameters_must_be_the_same_in_all():
@@ -377,6 +384,23 @@ def test_the_median_of_soft_gels_is_not_pulled_to_the_stiffest():
 def test_a_data_set_that_tells_nothing_does_not_count():
     middle, std = np.array([2.0, 2.1, 2.2, 0.0, 0.0, 0.0, 0.0]), np.array([0.1] * 3 + [1.0] * 4)
     assert median_of(middle, std, member_stream(1, "a"))[0] == pytest.approx(2.1, abs=0.05)
+
+
+def test_a_data_set_with_wrong_readings_counts_a_tenth_in_the_median_one_by_one():
+    """Two of five whose readings are wrong lie far above; full members of the median, they would be its upper end."""
+    rng, level = np.random.default_rng(2), np.array([0.0, 0.1, 0.2, 3.0, 3.1])
+    own = 0.01 * rng.standard_normal((5, 400, 1))
+    likelihoods = [OwnLikelihood(None, None, Following(np.array([[0.5]]), np.zeros(1)), z) for z in own]
+    sets = [middle + z for middle, z in zip(level, own, strict=True)]
+    before = HyperPrior().odd_before([False] * 3 + [True] * 2)
+    alike, doubted = (
+        _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1, odd)[0] for odd in (np.full(5, 0.05), before)
+    )
+    assert alike.quantiles[1] == pytest.approx(0.2, abs=0.02)
+    assert doubted.quantiles[1] == pytest.approx(0.11, abs=0.03)
+    assert doubted.between < 0.5 * alike.between
+    without = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1, np.zeros(5))[0]
+    np.testing.assert_allclose(without.quantiles, alike.quantiles, rtol=1e-9)
 
 
 def test_data_sets_known_exactly_have_their_median():

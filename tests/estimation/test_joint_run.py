@@ -57,12 +57,13 @@ def test_files_and_table(campaign, tmp_path):
 
 def test_two_runs_with_one_name_of_a_data_set(campaign, tmp_path):
     runs = []
-    for i in range(2):
+    for i, name in enumerate(("toy", "toy", "toy_2")):
         folder = tmp_path / f"day{i}"
         folder.mkdir()
-        runs.append(run_campaign(write_toy(folder, data=csv_text(nth=i)), overrides=_quiet(folder)).directory)
+        path = write_toy(folder, data=csv_text(nth=i))
+        runs.append(run_campaign(path, overrides={**_quiet(folder), "data.name": name}).directory)
     found, _ = join(runs, ["k"], tmp_path / "out")
-    assert found.datasets == ("toy", "toy_2")
+    assert found.datasets == ("toy", "toy_2", "toy_2_2")
 
 
 def test_the_same_bits_again(campaign, tmp_path):

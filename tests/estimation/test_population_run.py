@@ -147,6 +147,8 @@ def test_a_data_set_whose_readings_are_warned_of_counts_only_with_the_others(cam
     assert stored.belongs["set2"] < 0.6 < min(stored.belongs["set0"], stored.belongs["set1"])
     line = "Counted only as far as the others bear them out, since warnings say that their readings are wrong: set2."
     assert line in sentences(stored)
+    (alone,) = (sentence for sentence in sentences(stored) if "one by one" in sentence)
+    assert "its data took away, set2 at a fraction of it, for warnings say that readings there are wrong" in alone
     assert "and of 0.9 if warnings of its own say that readings are wrong (set2)" in page.read_text()
     assert _doubted([replace(s, cautions=(replace(wrong, severity="caution"),)) for s in sets]) == set()
     assert _doubted([replace(s, cautions=(wrong,)) for s in sets]) == set()  # what most share is no oddity

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -51,6 +52,18 @@ def test_no_exchange_is_better_where_readings_lie_apart(about):
     assert found in allowed
     assert len(allowed) > 4
     assert _gain(planned, found) == pytest.approx(max(_gain(planned, taken) for taken in allowed), abs=1e-9)
+
+
+def test_readings_of_weight_zero_are_none_to_choose_from():
+    """One that tells least, and whatever else is not among the four best, so that a fifth would be one of them."""
+    planned = _planned()
+    best = choose(planned, planned.draws(30, 1), 4)
+    planned.problem = replace(
+        planned.problem, observations=replace(planned.problem.observations, weights=1.0 * np.isin(range(12), best))
+    )
+    np.testing.assert_array_equal(choose(planned, planned.draws(30, 1), 4), best)
+    with pytest.raises(ConfigError, match="no 5 of 4 readings"):
+        choose(planned, planned.draws(30, 1), 5)
 
 
 def test_choices_that_are_not_possible():

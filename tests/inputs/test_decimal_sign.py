@@ -94,3 +94,13 @@ def test_a_workbook_has_no_thousands_in_its_numbers(tmp_path):
     columns = read_contents(tmp_path / "a.xlsx", Layout(decimal=",")).columns
     assert columns["R"].tolist() == [1.201, 102.345, 998]
     assert columns["note"].tolist() == [1600.5, 1600, 0.5]
+
+
+@pytest.mark.parametrize("german", [False, True])
+def test_data_sets_of_one_table_have_one_decimal_sign(tmp_path, german):
+    """The numbers of the first tell it of the second, which alone might be 1.201 and 1.3."""
+    text = "t;gel;R\n0;a;998.2\n1;a;1,001.5\n2;a;1,003\n0;b;1,201\n1;b;1,300\n2;b;1,405\n"
+    (tmp_path / "a.csv").write_text(text.translate(MIRROR) if german else text, encoding="utf-8")
+    layout, columns = Layout(by="gel", decimal=","), (Column("t", "s", "s"), Column("R", "um", "um"))
+    each = [read_series(tmp_path / "a.csv", *columns, layout, part=part).values.tolist() for part in "ab"]
+    assert each == [[998.2, 1001.5, 1003], [1201, 1300, 1405]]

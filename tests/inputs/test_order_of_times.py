@@ -66,3 +66,15 @@ def test_of_vectors_no_column_is_asked_for(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"t": np.tile(T, 2), "R": np.concatenate([A, B])})
     with pytest.raises(DataError, match=r"sample 21: .*: give each a file of its own$"):
         read_series(tmp_path / "a.mat", TIME, RADIUS)
+
+
+def test_a_bound_is_not_averaged_with_a_reading(tmp_path: Path) -> None:
+    """The mean of 3 and of at most 5 would be at most 4."""
+    path, mark = tmp_path / "t.csv", Column("below", "1", "1", kind="mark")
+    layout, rows = Layout(repeated="average"), ["0,1,0", "0,3,0", "1,3,0", "2,5,1"]
+    path.write_text("\n".join(["t,R,below", *rows]))
+    read = read_series(path, TIME, RADIUS, layout, [mark])
+    assert read.errors["below"].tolist() == [0, 0, 1]
+    path.write_text("\n".join(["t,R,below", *rows, "2,3,0"]))
+    with pytest.raises(DataError, match=r"t\.csv: a bound is not averaged .*series of their own"):
+        read_series(path, TIME, RADIUS, layout, [mark])

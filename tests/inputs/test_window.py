@@ -123,7 +123,7 @@ def test_times_include_both_ends() -> None:
 
 
 def test_refused() -> None:
-    with pytest.raises(DataError, match="asks for minimum 4, but only 3 minima with a prominence of 10%"):
+    with pytest.raises(DataError, match="asks for minimum 4, but only 3 minima with a prominence of 10 %"):
         cut(BOUNCES, "start", "minimum 4")
     with pytest.raises(DataError, match="empty"):
         cut(BOUNCES, "3 s", "2 s")

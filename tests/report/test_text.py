@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from en4dvar.plumbing.hints import percent
 from en4dvar.report import text
 from en4dvar.report.chart import GREYS, ramp
 from en4dvar.report.export import is_math, latex_unit
@@ -62,7 +63,7 @@ def test_plus_minus(mean, std, shown):
 
 
 def test_no_minus_stands_before_a_rounded_zero():
-    assert (text.percent(-0.004), text.percent(-0.06), text.percent(float("nan"))) == ("0 %", "−6 %", "–")
+    assert (percent(-0.004), percent(-0.06), percent(float("nan"))) == ("0 %", "−6 %", "–")
 
 
 @pytest.mark.parametrize(

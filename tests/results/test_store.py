@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import netCDF4
@@ -100,6 +101,11 @@ def test_dataframe_is_one_row_a_member(result, analysis):
     np.testing.assert_array_equal(frame.to_numpy(), analysis.posterior)
 
 
+def test_the_history_holds_no_folders_of_the_machine():
+    command = "en4dvar run /home/me/gel.yaml --out '/home/me/my runs/gel'"
+    assert provenance("", command=command)["history"].split("Z ")[1].startswith("en4dvar run gel.yaml --out 'gel' (")
+
+
 def test_two_saves_hold_the_same_bits(result, analysis, tmp_path):
     first = load_result(result.save(tmp_path / "a.nc"))
     again = Result.from_analysis(analysis, provenance("other text"))
@@ -110,6 +116,16 @@ def test_two_saves_hold_the_same_bits(result, analysis, tmp_path):
             a, b = variable.values, twin[name].values
             assert a.dtype == b.dtype
             assert a.tolist() == b.tolist() if a.dtype == object else a.tobytes() == b.tobytes()
+
+
+def test_the_fit_is_that_of_readings_that_count(analysis):
+    """One of weight 0 that is far off is as if it were not there."""
+    o, far = analysis.observations, np.arange(len(analysis.observations)) == 2
+    left_out = replace(o, values=np.where(far, 1e3 * o.values, o.values), weights=np.where(far, 0.0, o.weights))
+    of_it = replace(analysis, problem=replace(analysis.problem, observations=left_out))
+    y, mean = o.values[~far], np.nanmean(analysis.posterior_predictions, axis=0)[~far]
+    expected = 1 - np.sqrt(np.sum((y - mean) ** 2) / np.sum((y - y.mean()) ** 2))
+    assert Result.from_analysis(of_it, {}).groups["/sample_stats"].attrs["nrmse"] == pytest.approx(expected, rel=1e-12)
 
 
 def test_arviz_reads_it(path):

@@ -239,9 +239,9 @@ def test_a_model_without_step_and_several_files(folder):
 
 def test_other_commands_say_what_it_is(folder):
     path = written(folder)
-    with pytest.raises(ConfigError, match="a sequence: it can be run and validated"):
+    with pytest.raises(ConfigError, match="sequence: it makes the file a sequence, for 'en4dvar run'"):
         en4dvar.load_config(path)
-    with pytest.raises(ConfigError, match="not a sequence"):
+    with pytest.raises(ConfigError, match="it makes the file a twin experiment"):
         load_sequence(CONFIGS / "linear_etkf.yaml")
     with pytest.raises(DataError):
         run_sequence(written(folder, data={**BASE["data"], "path": "none.csv"}))

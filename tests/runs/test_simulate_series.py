@@ -10,8 +10,10 @@ from problem.series_models import CELLS
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
+from en4dvar.config.document import read_document
+from en4dvar.config.kinds import resolve_campaign
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.runs.simulation import noise_level, simulate, to_csv
+from en4dvar.runs.simulation import draw_campaign, noise_level, simulate, to_csv, write_campaign
 
 YAML = """\
 name: two
@@ -90,3 +92,19 @@ def test_a_series_of_many_places_is_refused(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, YAML.replace("places: 3.5 m", "places: {column: x, unit: m}")))
     with pytest.raises(ConfigError, match="well is read at many places"):
         simulate(config)
+
+
+def test_a_campaign_on_another_scale_loses_no_digits(tmp_path):
+    """Pulses of nanoseconds and picometres of a model that shows seconds and micrometres."""
+    path = tmp_path / "twin.yaml"
+    path.write_text(
+        "name: twin\nseed: 3\nmodel: {name: toy_models:Oscillator, mass: 2e-9 g}\ncampaign: {directory: data, "
+        "first: [0 s, 0.1 us], spacing: [50 ns, 80 ns], stop: 0.1, most: 40, noise: 1 fm, groups: "
+        "{a: {datasets: 1, parameters: {A: 1 pm, k: 3 N/m, c: 0 N s/m}}}}\n"
+    )
+    plan = resolve_campaign(read_document(path), tmp_path)
+    (drawn,) = sets = draw_campaign(plan)
+    write_campaign(plan, sets, tmp_path / "data", "simulate")
+    told = np.genfromtxt(tmp_path / "data" / "a_01.csv", delimiter=",", comments="#", skip_header=4)
+    np.testing.assert_allclose(told[:, 0], drawn.times, rtol=0, atol=50e-12)
+    np.testing.assert_allclose(1e-6 * told[:, 1], drawn.values, rtol=0, atol=1e-18)

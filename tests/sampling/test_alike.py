@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from en4dvar.sampling.alike import standing_for
+from en4dvar.sampling.modes import WeightedDraws
 
 WIDTH = 0.05
 
@@ -61,3 +62,19 @@ def test_too_few_members_are_the_chosen_draws():
     np.testing.assert_array_equal(
         standing_for(x, np.zeros(100, dtype=np.intp), np.array([4, 7]), *moments(x)), x[[4, 7]]
     )
+
+
+def test_members_of_weighted_draws_are_the_same_in_any_units():
+    """They are drawn evenly along the direction in which parameters vary most, not along that of the largest unit."""
+    stream = np.random.default_rng(6)
+    x, shares, sizes = stream.standard_normal((600, 2)), stream.dirichlet(np.ones(600)), np.array([2.0**20, 2.0**-40])
+    x[:, 1] += 0.5 * x[:, 0]
+    mode = (x[:, 0] > 1).astype(np.intp)
+    alike, mixed = (
+        WeightedDraws(x * of, shares, mode, np.zeros(600), 0.0, x[0], None).members(
+            48, np.random.default_rng(7), exact=False
+        )
+        / of
+        for of in (np.ones(2), sizes)
+    )
+    np.testing.assert_allclose(mixed, alike)

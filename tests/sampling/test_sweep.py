@@ -17,6 +17,7 @@ from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
+from en4dvar.data.series import Part
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import NOISE_SCALE
 from en4dvar.plumbing.errors import ConfigError, DataError
@@ -70,6 +71,21 @@ def test_a_trace_through_the_shifted_readings_is_a_perfect_fit():
     nrmse, shift = best_over_shifts(trace[None], aims)
     assert nrmse[0, 0] == pytest.approx(1, abs=1e-9)
     assert shift[0, 0] == pytest.approx(0.5)
+
+
+def test_a_reading_of_weight_zero_or_a_bound_is_none():
+    o = readings(np.arange(5.0, 25.0, 1.5), 10 + np.arange(14.0) ** 2)
+    odd = replace(o, values=np.where(np.arange(14) == 6, 1e3, o.values), weights=1.0 * (np.arange(14) != 6))
+    bound = replace(odd, noise=noise_of(np.ones(14), sides=1.0 * (np.arange(14) == 6)), weights=np.ones(14))
+    some = readings(np.delete(o.times, 6), np.delete(o.values, 6))
+    trace = 8 + np.arange(14.0) ** 2
+    expected, aims = targets([some], shift=0.0, step=1.5), targets([odd, bound], shift=0.0, step=1.5)
+    assert aims.grid == pytest.approx(expected.grid)
+    (found,), ((alone,),) = (best_over_shifts(trace[None], of)[0] for of in (aims, expected))
+    assert found == pytest.approx([alone, alone])
+    for alike in (replace(o, values=np.ones(14)), replace(odd, weights=np.zeros(14))):
+        with pytest.raises(ValueError, match="a: a fit by NRMSE needs readings"):
+            targets([o, alike], shift=0.0, step=1.5)
 
 
 def test_a_constant_at_the_mean_has_nrmse_zero_and_a_lost_trace_none():
@@ -135,6 +151,14 @@ def test_parameters_of_the_errors_are_not_searched(problems, whole):
     np.testing.assert_array_equal(again.theta, whole.theta)
     with pytest.raises(ConfigError, match="nothing but a time shift and errors"):
         run_sweep([replace(p, prior=p.prior.of(p.prior.terms[-1:])) for p in scaled], SMALL, seed=1)
+
+
+def test_a_data_set_of_several_series_is_refused(problems):
+    """All of them would be compared with the first observable."""
+    one = problems[0]
+    part = Part("R", one.observable, 0, len(one.observations))
+    with pytest.raises(ConfigError, match="a sweep fits data sets of one series"):
+        run_sweep([replace(one, observations=replace(one.observations, parts=(part,)))], SMALL, seed=1)
 
 
 def test_weighted_moments(whole):

@@ -213,6 +213,8 @@ def _structure(case: Case) -> str:
 
 
 def _missed(case: Case) -> str:
+    if case.caution.severity == "note":
+        return "no action is needed: the intervals contain it"
     if case.caution.severity != "serious":
         if case.timing:
             return case.timing

@@ -15,7 +15,7 @@ from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
-from en4dvar.plumbing.hints import counted, listed
+from en4dvar.plumbing.hints import counted, listed, percent
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, PriorTerm
 
@@ -28,6 +28,7 @@ MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a pos
 SERIOUS: Severity = "serious"
 THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all members is there
 NOTHING = 0.5  # of the readings' own std: a discrepancy beyond it in nearly all members leaves little explained
+HARDLY = 0.1  # share of a variance: a shift of a third of the std, with which a 90 % interval holds the truth at 89 %
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
@@ -110,14 +111,14 @@ def structure(analysis: Analysis) -> Findings:
             f"the reading at {moments(analysis)[which]} {CLOCK} is farther off than the scatter of the residuals "
             f"explains (probability {_chance(probability)}); by its own error it is "
             f"{abs(residuals.studentised[place]):.1f} standard deviations off, with a leverage of "
-            f"{residuals.leverage[place]:.0%}"
+            f"{percent(residuals.leverage[place])}"
         )
         yield caution("odd-residuals", words)
 
 
 def missed(analysis: Analysis) -> Findings:
     """A discrepancy that is there: what the residuals show of it widens the intervals, what parameters absorbed does
-    not. Serious where it is a large part of what there is to explain.
+    not. Serious where it is a large part of what there is to explain; a note where no estimate depends on it.
     """
     names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
     if amplitude is None or amplitude.name not in names:
@@ -136,7 +137,13 @@ def missed(analysis: Analysis) -> Findings:
     else:
         words = f"the model misses the readings {by}, beside errors of {shown(error, amplitude)}"
         absorbed = "the intervals allow for what shows in the residuals, not for what the parameters have absorbed"
-        yield caution("discrepancy-found", f"{words}: {absorbed}")
+        own = [j for j, name in enumerate(names) if name not in analysis.problem.of_errors]
+        share = max(analysis.discrepancy.shares[own, 1], default=1.0) if analysis.discrepancy and own else 1.0
+        if share < HARDLY:
+            words = f"{words}, which make up at most {percent(share)} of the variance of a parameter"
+            yield caution("discrepancy-found", words, "note")
+        else:
+            yield caution("discrepancy-found", f"{words}: {absorbed}")
 
 
 def moments(analysis: Analysis) -> list[str]:
@@ -227,7 +234,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
             share = float(np.mean(near & (outside | (sign * (after - bound) >= 0))))
             usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
-                words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
+                words = f"{percent(share)} of the posterior members of {parameter.name} pile up at its {side} bound"
                 yield caution("at-bound", f"{words} ({shown(bound, parameter)})", parameters=(parameter.name,))
 
 

@@ -17,6 +17,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members
 from en4dvar.diagnosis.response.what_if import in_std_as_likely
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import percent
 
 ASSUMED = "the assumptions of the what-if table"
 READINGS, MISSED, OWN = "the errors of the readings", "what the model misses", "its own prior"
@@ -71,7 +72,7 @@ def budget_words(a: Analysis, name: str) -> str:
     sources = {source: share for source, share in budget(a, name).items() if share >= TOLD}
     if not sources:
         return ""
-    line = f"variance of {name}: {', '.join(f'{share:.0%} {source}' for source, share in sources.items())}"
+    line = f"variance of {name}: {', '.join(f'{percent(share)} {source}' for source, share in sources.items())}"
     first = largest(sources, int(active_members(a.posterior_failures).sum()))
     if any(source not in a.problem.prior.names for source in first):
         return line

@@ -92,7 +92,7 @@ class Evaluated:
 def span_of_runs(
     planned: Planned, sizes: SampleSizes, method: Method, choice: bool = False, laws: int = 0
 ) -> tuple[int, int]:
-    """Forward runs of :func:`evaluate`, about, at least and at most."""
+    """Forward runs of :func:`evaluate`, about, at least and as a rule at most."""
     n, simulated = len(planned.names), min(sizes.simulated, sizes.draws)
     runs = sizes.draws + n + 1 if method == "linear" else sizes.draws * (n + 1)
     runs += (choice * sizes.draws + laws * sizes.simulated) * (n + 1)
@@ -100,7 +100,7 @@ def span_of_runs(
     if method == "nested":
         runs += simulated * (n + 1)
         integrals += simulated * (1 if planned.asked == n else 2)
-    least, most = span_of_rounds(integrals)
+    least, most = span_of_rounds(integrals, sizes.inner)
     return runs + least * sizes.inner, runs + most * sizes.inner
 
 
@@ -252,6 +252,7 @@ def _largest(measure: Callable[[float], float], wanted: float, most: float) -> f
 
 def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indices:
     """The ``count`` readings that tell most, each ``apart`` from the others in time, from draws (R, n) of the prior.
+    Readings of weight 0 are none to choose from.
 
     Raises ConfigError: errors that are correlated; no such choice is possible. TooFewMembersError: the model mostly
     fails.
@@ -262,8 +263,9 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
     tangents = planned.tangents(u)
     require_alive(len(tangents.at), len(u))
     _, rows = tangents.whitened(planned)
-    search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2]), planned.asked)
-    near = np.abs(np.subtract.outer(observations.times, observations.times)) < apart * (1 - 1e-9)
+    counted = np.flatnonzero(observations.weights)
+    search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2])[:, :, counted], planned.asked)
+    near = np.abs(np.subtract.outer(*[observations.times[counted]] * 2)) < apart * (1 - 1e-9)
     np.fill_diagonal(near, True)
     chosen: list[int] = []
     for _ in range(count):
@@ -271,7 +273,7 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
         possible = (k for k in order if not near[chosen, k].any() and _room(near, [*chosen, k]) >= count)
         best = next(possible, None)
         if best is None:
-            raise ConfigError(f"no {count} of {len(observations)} readings lie so far apart from each other")
+            raise ConfigError(f"no {count} of {len(counted)} readings lie so far apart from each other")
         chosen.append(best)
         search.add(best, 1)
     for _ in range(SWEEPS):
@@ -286,7 +288,7 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
             search.add(chosen[place], 1)
         if not moved:
             break
-    return np.sort(np.array(chosen, dtype=np.intp))
+    return counted[np.sort(np.array(chosen, dtype=np.intp))]
 
 
 class _Search:

@@ -27,6 +27,7 @@ too large, by the same amount to second order; I is their mean. E[P(k | y)] of t
 P, is the probability that it will have: 1/L where readings tell nothing, 1 where they decide.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -70,9 +71,11 @@ class Nested(Gains):
         return float(difference.mean()), standard_error(difference)
 
 
-def span_of_rounds(integrals: int) -> tuple[int, int]:
-    """The rounds of runs of so many ``integrals`` of :func:`explained`, at least and at most."""
-    return 2 * integrals, (CLOSING + 3 * ROUNDS) * integrals
+def span_of_rounds(integrals: int, inner: int) -> tuple[int, int]:
+    """The rounds of so many runs, of so many ``integrals`` of :func:`explained`, at least and as a rule at most: enough
+    draws of a proposal half as good as is aimed at. A few hard integrals may take CLOSING + 3 ROUNDS each, never all.
+    """
+    return 2 * integrals, (CLOSING + min(math.ceil(2 * ENOUGH / (GOOD * inner)), 3 * ROUNDS)) * integrals
 
 
 def nested(planned: Planned, u: Array, inner: int, seed: int, check: bool = False) -> Nested:

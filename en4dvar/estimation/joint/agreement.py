@@ -288,8 +288,9 @@ def trends(problems: Sequence[InverseProblem], values: Array, names: Sequence[st
 
 
 def _covariates(problems: Sequence[InverseProblem]) -> Iterator[tuple[str, Array]]:
-    """What values are held against, and it (S,)."""
+    """What values are held against, and it (S,), of readings that count."""
+    counted = [(p.observations, p.observations.used) for p in problems]
     yield "the order of the data sets", np.arange(len(problems), dtype=float)
-    yield "the largest reading", np.array([float(p.observations.values.max()) for p in problems])
-    steps = [np.median(np.diff(p.observations.instants[0])) for p in problems]
+    yield "the largest reading", np.array([float(o.values[used].max()) for o, used in counted])
+    steps = [np.median(np.diff(np.unique(o.times[used])) if np.ptp(o.times[used]) else 0.0) for o, used in counted]
     yield "the time between readings", np.array([float(f"{x:.4g}") for x in steps])  # of one camera they are the same

@@ -230,13 +230,16 @@ def population_of(
 
     Raises
     ------
-    ConfigError: fewer than 3 data sets; readings that would count twice; other parameters in one than in another, or
-        such as vary in time; a prior of ``names`` that is correlated, or not the same in all. ValueError: fewer than 3
-        data sets have successful runs.
+    ConfigError: fewer than 3 data sets, or two of one name, which random numbers belong to; readings that would count
+        twice; other parameters in one than in another, or such as vary in time; a prior of ``names`` that is
+        correlated, or not the same in all. ValueError: fewer than 3 data sets have successful runs.
     """
     if len(problems) < FEWEST_SETS:
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
+    called = [problem.observations.name for problem in problems]
+    if twice := sorted({name for name in called if called.count(name) > 1}):
+        raise ConfigError(f"data sets of a population need different names: {', '.join(twice)} twice")
     require_distinct([problem.observations for problem in problems])
     hyper, effort = hyper or HyperPrior(), effort or Effort()
     if (factor := math.hypot(hyper.mean_std, hyper.spread)) > REACH:
@@ -358,22 +361,24 @@ def population_from(
         theta=theta,
         belongs=estimated.belongs,
         odd_before=before,
-        empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
+        empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed, before),
         uncertain=float(estimated.uncertain.sum()),
         left_out=left_out,
     )
 
 
 def _empirical(
-    terms: Sequence[PriorTerm], members: Sequence[Array], likelihoods: Sequence[OwnLikelihood], seed: int
+    terms: Sequence[PriorTerm], members: Sequence[Array], likelihoods: Sequence[OwnLikelihood], seed: int, before: Array
 ) -> tuple[Empirical, ...]:
-    """The median over data sets of each parameter, from members (N_i, p) of each."""
+    """The median over data sets of each parameter, from members (N_i, p) of each, which are odd with the probability
+    ``before`` (S,): by what is known of them alone, for the check must not depend on the hierarchy."""
+    credible = (1 - before) / (1 - before.min())
     middle = np.array([np.median(z, axis=0) for z in members])
     std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
     slopes, logs = likelihoods[0].following.slopes, likelihoods[0].following.logs
     each = (Following(slopes[j : j + 1], logs[j : j + 1]) for j in range(len(terms)))
     pairs = zip(terms, middle.T, std.T, each, strict=True)
-    return tuple(empirical(term, m, s, following, seed) for term, m, s, following in pairs)
+    return tuple(empirical(term, m, s, following, seed, credible) for term, m, s, following in pairs)
 
 
 def _sets(

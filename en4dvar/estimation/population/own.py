@@ -389,18 +389,21 @@ class Empirical:
     common: float
 
 
-def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, seed: int) -> Empirical:
+def empirical(
+    term: PriorTerm, middle: Array, std: Array, following: Following, seed: int, credible: Array | float = 1.0
+) -> Empirical:
     """The median of data sets one by one, with its interval from their scatter: an answer that needs no model of them,
     of their medians and standard deviations (S,) in white coordinates; ``following``: of this coordinate alone.
 
     It stands beside that of the hierarchy as a check, and alone where there is no other. Each data set counts by the
     share of its prior's variance that its data took away, 1 − s², s the standard deviation of its own posterior without
-    what all have in common: one that tells nothing has the prior's median. Weights 1/s² would pull the median up, where
-    the posterior of a logarithm is the wider the lower its value, as of soft gels. The interval is that of Student's t
-    with the standard deviation of the weighted median under resampling of the data sets (Efron 1979, Ann. Stat. 7, 1),
-    which is not taken to be smaller than the standard error of the weighted mean of data sets that agree.
+    what all have in common: one that tells nothing has the prior's median. Where its own warnings say that readings are
+    wrong it counts only as far as it is ``credible`` (S,), beside the others. Weights 1/s² would pull the median up,
+    where the posterior of a logarithm is the wider the lower its value, as of soft gels. The interval is that of
+    Student's t with the standard deviation of the weighted median under resampling of the data sets (Efron 1979, Ann.
+    Stat. 7, 1), which is not taken to be smaller than the standard error of the weighted mean of data sets that agree.
     """
-    centre, spread = median_of(middle, std, member_stream(seed, f"empirical {term.parameter.name}"))
+    centre, spread = median_of(middle, std, member_stream(seed, f"empirical {term.parameter.name}"), credible)
     factor = float(stdtrit(len(middle) - 1, 1 - TAIL) / ndtri(1 - TAIL))
 
     def physical(own: float, common: float) -> Array:
@@ -412,9 +415,11 @@ def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, 
     return Empirical(physical(z, z), float(between), float(shared))
 
 
-def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
+def median_of(
+    middle: Array, std: Array, stream: np.random.Generator, credible: Array | float = 1.0
+) -> tuple[float, float]:
     """The weighted median of data sets (S,), and its standard deviation."""
-    weights = np.maximum(1 - std**2, SILENT)
+    weights = np.maximum(1 - std**2, SILENT) * credible
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
     medians = np.array([_weighted_median(middle[of], weights[of]) for of in chosen])
     spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))

@@ -1,0 +1,64 @@
+"""Each command, given a file or a folder that is for another one, says in one line which one that is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from init_files import call
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+OTHERS = {  # file → the words that say which command it is for, and the commands that can do nothing with it
+    "linear_design": ("'en4dvar design'", "run", "validate", "calibrate", "sweep", "sweep-twin", "study"),
+    "lorenz96_etkf": ("'en4dvar run' and 'en4dvar sweep-twin'", "simulate", "calibrate", "design", "sweep", "study"),
+    "bubble_sequence": ("for 'en4dvar run'", "simulate", "calibrate", "design", "sweep", "sweep-twin", "study"),
+    "agarose_twin": (
+        "for 'en4dvar simulate'",
+        "run",
+        "validate",
+        "calibrate",
+        "design",
+        "sweep",
+        "sweep-twin",
+        "study",
+    ),
+    "agarose_study": ("for 'en4dvar study'", "run", "validate", "simulate", "calibrate", "design", "sweep-twin"),
+    "quickstart": ("for 'en4dvar run'", "sweep-twin", "study"),
+}
+WITH = {"sweep-twin": ("--vary", "assimilation.members=[20]"), "calibrate": ("--sets", "2")}
+
+
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize(
+    ("name", "command"), [(name, command) for name, (_, *commands) in OTHERS.items() for command in commands]
+)
+def test_a_file_for_another_command(name: str, command: str) -> None:
+    result = call(command, CONFIGS / f"{name}.yaml", *WITH.get(command, ()))
+    (line,) = result.stderr.splitlines()
+    assert result.exit_code == 2
+    assert OTHERS[name][0] in line
+
+
+def test_simulate_of_a_plan_asks_for_its_instants() -> None:
+    result = call("simulate", CONFIGS / "linear_design.yaml")
+    assert "no such file" in result.stderr
+    assert "--times FROM:TO:STEP" in result.stderr
+    assert call("simulate", CONFIGS / "linear_design.yaml", "--times", "0:4:1").exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["report", "rerun", "export", "joint", "population --of G", "compare"])
+def test_a_configuration_in_place_of_a_run(tmp_path: Path, command: str) -> None:
+    name, *more = command.split()
+    path, other = CONFIGS / "quickstart.yaml", tmp_path / "other.yaml"
+    other.write_text("")
+    result = call(name, path, *([other] if name == "compare" else more))
+    assert result.exit_code == 2
+    assert f"'en4dvar run {path}' makes one" in result.stderr
+
+
+def test_a_run_in_place_of_a_configuration(tmp_path: Path) -> None:
+    for name in ("config.yaml", "config.resolved.yaml", "posterior.nc"):
+        (tmp_path / name).write_text("")
+    result = call("run", tmp_path)
+    assert result.exit_code == 2
+    assert "a folder, not a configuration; it holds config.resolved.yaml, config.yaml" in result.stderr
