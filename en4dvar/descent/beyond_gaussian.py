@@ -142,11 +142,8 @@ class _Linear:
         return log, mean, root, size
 
     def _moments(self, draws: Array) -> tuple[Array, Array, Array, Array]:
-        observations, rest, apart = (
-            self.problem.observations,
-            self.mode[~self.of_errors],
-            draws - self.mode[self.of_errors],
-        )
+        observations, rest = self.problem.observations, self.mode[~self.of_errors]
+        apart = draws - self.mode[self.of_errors]
         of_h, of_u = self.slopes[self.of_errors], self.slopes[~self.of_errors]
         predicted = self._predicted(draws, self.at.values + apart @ of_h)
         log = -observations.cost(predicted) - 0.5 * rest @ rest

@@ -54,14 +54,19 @@ def min_norm_fit(design: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0])
 
 
+def sizes(rows: Array) -> Array:
+    """Root mean squares (n,) of the columns of ``rows`` (r, n), 1 of one of zeros: over these, units do not matter."""
+    of_columns = np.sqrt(np.mean(rows**2, axis=0))
+    return np.asarray(np.where(of_columns > 0, of_columns, 1.0))
+
+
 def least_coordinates(directions: Array, changes: Array) -> Array:
     """The shortest coordinates (…, r) of ``changes`` (…, n), which are these times the ``directions`` (r, n).
 
     Columns are scaled first, so units do not matter: with a pressure in Pa beside a time in s, all but the pressure
     would be taken for rounding.
     """
-    scale = np.sqrt(np.mean(directions**2, axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = sizes(directions)
     return min_norm_fit((directions / scale).T, (changes / scale).T).T
 
 

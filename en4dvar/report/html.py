@@ -45,7 +45,7 @@ def _environment(package: str) -> Environment:
     environment = Environment(loader=PackageLoader(package, "."), autoescape=True, undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
     environment.filters |= {"upper_first": text.upper_first, "with_symbols": text.with_symbols}
-    environment.filters |= {"without_folders": text.without_folders, "with_micro": text.with_micro}
+    environment.filters |= {"without_folders": text.without_folders, "typeset": text.typeset}
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"

@@ -48,11 +48,11 @@ def pretty_unit(unit: str) -> str:
     return re.sub(r"\s*\*\s*|\s+", "·", text)
 
 
-def with_micro(words: object) -> Markup:
+def typeset(words: object) -> Markup:
     """``"at 18.2 us"`` → ``"at 18.2 µs"``, as the tables of a page write it, and powers of e with their exponent above;
     everything else is escaped text.
 
-    >>> print(with_micro("1.4 um in 2 uses, 5 us, e^12.4 times < 1"))
+    >>> print(typeset("1.4 um in 2 uses, 5 us, e^12.4 times < 1"))
     1.4 µm in 2 uses, 5 µs, e<sup>12.4</sup> times &lt; 1
     """
     text = re.sub(r"(?<=\d )u\w+\b", lambda m: pretty_unit(m[0]) if is_unit(m[0]) else m[0], str(words))

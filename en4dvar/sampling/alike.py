@@ -7,6 +7,7 @@ than they fit draws. Exchanged draws miss means by a hundredth, standard deviati
 
 import numpy as np
 
+from en4dvar.ensemble.linalg import sizes
 from en4dvar.model.state import Array, Indices
 
 LEVELS = (0.05, 0.25, 0.75, 0.95)  # of each parameter, below which members have as large a share as all draws
@@ -23,8 +24,7 @@ def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covarian
     """
     n = x.shape[1]
     apart = x[chosen] - x[chosen].mean(axis=0)
-    largest = np.abs(apart).max(axis=0) + np.finfo(float).tiny  # units do not matter
-    if len(chosen) <= n or np.linalg.matrix_rank(apart / largest) < n:
+    if len(chosen) <= n or np.linalg.matrix_rank(apart / sizes(apart)) < n:
         return np.asarray(x[chosen])
     z = np.linalg.solve(np.linalg.cholesky(np.atleast_2d(covariance)), (x - mean).T).T
     upper = np.triu_indices(n)

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.linalg import centre, sizes
 from en4dvar.model.state import Array, Indices
 from en4dvar.priors.prior import whiten_sample
 
@@ -55,7 +55,7 @@ class ModelError:
         With P = V S² Vᵀ of the anomalies U S Vᵀ √(N−1), the anomalies become U (I + S⁻¹VᵀQV S⁻¹)^{1/2} S Vᵀ √(N−1).
         """
         anomalies = states - states.mean(axis=0)
-        scale = _size(anomalies)
+        scale = sizes(anomalies)
         u, s, vt = np.linalg.svd(anomalies / scale, full_matrices=False)
         spanned = s > SPANNED * s.max(initial=0.0)
         u, s, vt = u[:, spanned], s[spanned] / np.sqrt(len(states) - 1), vt[spanned]
@@ -70,19 +70,13 @@ def narrowed(states: Array, widened: Array, smoothed: Array) -> Array:
     moved. In moments m ← m + Gᵀ (m_s − m), P ← P + Gᵀ (P_s − P_w) G, G = P_w⁺ P; anomalies change by a symmetric root.
     """
     (_, anomalies), (mean, wide) = centre(states), centre(widened)
-    scale = _size(wide)
+    scale = sizes(wide)
     _, s, vt = np.linalg.svd(wide / scale, full_matrices=False)
     spanned = s > s.max() * max(wide.shape) * np.finfo(float).eps
     inverse = vt[spanned].T / s[spanned] / scale[:, None]
     u, shared = np.linalg.qr(anomalies @ inverse)  # G = inverse @ shared.T @ u.T @ anomalies
     shift, later = centre((smoothed - mean) @ inverse @ shared.T)
     return states + shift @ (u.T @ anomalies) + _growth(u, later.T @ later - shared @ shared.T, anomalies)
-
-
-def _size(anomalies: Array) -> Array:
-    """Standard deviations (n,) of anomalies (N, n), 1 of what has none: over these, units do not matter."""
-    size = np.sqrt(np.sum(anomalies**2, axis=0) / (len(anomalies) - 1))
-    return np.asarray(np.where(size > 0, size, 1.0))
 
 
 def _growth(u: Array, core: Array, anomalies: Array) -> Array:
@@ -100,7 +94,7 @@ def fresh_noise(anomalies: Array, draws: Array) -> Array:
     centred = draws - draws.mean(axis=0)
     if len(draws) - 1 < draws.shape[1]:
         return np.asarray(centred)
-    u, s, _ = np.linalg.svd(anomalies / _size(anomalies), full_matrices=False)
+    u, s, _ = np.linalg.svd(anomalies / sizes(anomalies), full_matrices=False)
     basis = u[:, s > SPANNED * s.max(initial=0.0)]
     if len(draws) - 1 < basis.shape[1] + draws.shape[1]:
         return np.asarray(centred)

@@ -26,7 +26,7 @@ NAN = float("nan")
         (text.fixed, [(-1.25, 1), (-0.01, 1), (NAN, 2)], ["-1.2", "0.0", "–"]),
         (text.symbol_html, [r"$\mu$", r"$R_{\mathrm{eq}}$", "<b>"], ["<i>μ</i>", "<i>R</i><sub>eq</sub>", "&lt;b&gt;"]),
         (
-            text.with_micro,
+            text.typeset,
             ["1.4 um in 2 uses, at 18.2 us.", "set time_std: 0.1 us"],
             ["1.4 µm in 2 uses, at 18.2 µs.", "set time_std: 0.1 µs"],
         ),

@@ -265,7 +265,8 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
     _, rows = tangents.whitened(planned)
     counted = np.flatnonzero(observations.weights)
     search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2])[:, :, counted], planned.asked)
-    near = np.abs(np.subtract.outer(*[observations.times[counted]] * 2)) < apart * (1 - 1e-9)
+    times = observations.times[counted]
+    near = np.abs(np.subtract.outer(times, times)) < apart * (1 - 1e-9)
     np.fill_diagonal(near, True)
     chosen: list[int] = []
     for _ in range(count):

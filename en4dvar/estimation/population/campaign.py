@@ -7,6 +7,7 @@ in each. Each data set is sampled by itself (:mod:`~en4dvar.estimation.populatio
 population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`) as a likelihood.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -189,10 +190,9 @@ def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[
 def require_population(problems: Sequence[InverseProblem], names: Sequence[str]) -> None:
     """Raises :class:`ConfigError`, see :func:`population_of`."""
     terms_of(problems, names)
-    every = problems[0].constant.prior.names
-    for name, what in ((name, of.name) for name in names for of in fields(Draws) if f"{name}_{of.name}" in every):
-        called = f"{name}_{what}"  # in files
-        raise ConfigError(f"{called}: the {what} of the population of {name} has this name, too; call one otherwise")
+    for name, what in itertools.product(names, (of.name for of in fields(Draws))):
+        if (taken := f"{name}_{what}") in problems[0].constant.prior.names:  # a variable of its file
+            raise ConfigError(f"{taken}: the {what} of the population of {name} has this name, too; call one otherwise")
     for problem in problems:
         name = problem.observations.name
         check_problem(problem)

@@ -447,7 +447,7 @@ def example(p: Parameter, model: BubbleModel) -> Entry:
     if any(other.name == "G" for other in model.law.parameters):
         gels |= OF_GELS
     if p.name in gels:
-        return _spread(p, *gels[p.name], f"{SPAN.get(p.name, 'of gels')},", "know of yours")
+        return _spread(p, *gels[p.name], f"{SPAN.get(p.name, 'of gels')};", "know of your gel")
     text = _text(float(model.law.example_values()[p.name][0]), p.unit, p.display_unit)
     words = "an example value, not from the data"
     if p.transform == "lognormal":
