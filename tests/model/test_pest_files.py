@@ -28,7 +28,19 @@ def test_each_space_holds_its_parameter_in_its_width():
 
 @pytest.mark.parametrize(
     ("value", "width", "text"),
-    [(0.1, 12, "0.1"), (1e-7, 5, "1e-07"), (1e-7, 4, "1e-7"), (-123456.789, 7, "-123457"), (1 / 3, 3, "0.3")],
+    [
+        (0.1, 12, "0.1"),
+        (np.float64(0.1), 20, "0.1"),
+        (1e-7, 12, "1.0e-07"),
+        (1e-7, 5, "1.e-7"),
+        (1e-7, 4, "1e-7"),
+        (-123456.789, 8, "-123457."),
+        (-123456.789, 7, "-1.23e5"),
+        (1e120, 8, "1.0e+120"),
+        (123, 3, "123"),
+        (math.inf, 5, "inf"),
+        (1 / 3, 3, "0.3"),
+    ],
 )
 def test_a_number_keeps_as_many_digits_as_fit(value, width, text):
     assert languages.fitted(value, width) == text

@@ -85,16 +85,20 @@ def spaces_filled(text: str, parameters: Mapping[str, float]) -> str:
 def fitted(value: float, width: int) -> str:
     """A number in at most ``width`` characters, with as many digits as fit. Raises :class:`ProgramError`.
 
-    >>> fitted(0.1, 20), fitted(2 / 3, 8), fitted(-123456.789, 7)
-    ('0.1', '0.666667', '-123457')
+    It has a decimal point wherever one fits, for Fortran reads digits without one as decimals: 1e-05 as 1e-08 by E10.3.
+
+    >>> fitted(0.1, 20), fitted(1e-5, 20), fitted(2 / 3, 8), fitted(-123456.789, 7)
+    ('0.1', '1.0e-05', '0.666667', '-1.23e5')
     """
-    if len(repr(value)) <= width:
-        return repr(value)
-    for digits in range(17, 0, -1):
-        text = f"{value:.{digits}g}"
-        for form in (text, text.replace("e-0", "e-").replace("e+0", "e+")):
-            if len(form) <= width:
-                return form
+    shorter = [f"{value:.{digits}g}" for digits in range(17, 0, -1)]
+    for points in ((".0", "."), ("",)):
+        for text in (repr(float(value)), *shorter):
+            mantissa, e, exponent = text.partition("e")
+            for point in points:
+                pointed = f"{mantissa}{point}" if mantissa.lstrip("-").isdecimal() else mantissa
+                for power in (exponent, exponent.removeprefix("+").replace("-0", "-").removeprefix("0")):
+                    if len(form := f"{pointed}{e}{power}") <= width:
+                        return form
     raise ProgramError(f"{value!r} does not fit into {width} characters of a template")
 
 
