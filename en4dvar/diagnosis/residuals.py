@@ -24,7 +24,9 @@ ROUNDING = 1e-3  # standard deviations: residuals of which none is larger are th
 FITTED = 0.005  # of the leverage of a reading: what less leaves of its residual is the error of the linearisation
 NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
 OF_ERRORS = 0.5  # of the variance of the readings in a direction, beyond which it is of their errors, not of the prior
-FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
+EVEN = np.linspace(0.0, math.log1p(1e10), 1001)  # of ln (1 + u): with few weights the integrand falls slowly
+FREQUENCIES = np.expm1(EVEN)
+SIMPSON = EVEN[1] / 3 * (1 + FREQUENCIES) * np.concatenate([[1], np.tile([4, 2], 500)[:-1], [1]])
 
 
 @dataclass(frozen=True)
@@ -174,10 +176,9 @@ def positive_chance(weights: Array) -> float:
     >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
     (0.5, 0.7071)
     """
-    scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u
-    u = FREQUENCIES
+    scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u where weights are many
+    u = FREQUENCIES[1:]
     angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)
     fall = np.exp(-0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
-    integrand = np.sin(angle) * fall / u
-    area = float(np.trapezoid(integrand, u)) + float(u[0]) * 0.5 * float(scaled.sum())
+    area = float(SIMPSON[0] * 0.5 * scaled.sum() + SIMPSON[1:] @ (np.sin(angle) * fall / u))
     return min(1.0, max(0.0, 0.5 + area / math.pi))

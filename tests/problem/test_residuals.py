@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import bent, run, spiked
-from scipy.special import digamma, fdtrc
+from scipy.special import digamma, fdtrc, fdtri
 from toys import with_discrepancy
 
 from en4dvar.diagnosis.residuals import Residuals, positive_chance
@@ -53,6 +53,15 @@ def test_imhof_against_draws():
 def test_imhof_against_the_distribution_of_a_ratio_of_squares(count, ratio):
     weights = np.repeat([1.0, -ratio], [count // 2, count - count // 2])
     assert positive_chance(weights) == pytest.approx(fdtrc(count / 2, count / 2, ratio), abs=1e-4)
+
+
+@pytest.mark.parametrize("chance", [1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("counts", [(2, 1), (3, 2), (8, 8), (2, 40), (250, 250)])
+def test_imhof_of_what_is_improbable(counts, chance):
+    """Below 1e-6 stood where it was 1e-5, and with two directions left no chance was below 0.02."""
+    more, less = counts
+    weights = np.repeat([1 / more, -fdtri(more, less, 1 - chance) / less], counts)
+    assert positive_chance(weights) == pytest.approx(chance, rel=0.02, abs=2e-6)
 
 
 def test_leverages_add_up_to_the_degrees_of_freedom():
