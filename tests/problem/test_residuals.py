@@ -37,6 +37,28 @@ def test_chances_are_uniform_where_the_model_is_right():
         assert np.mean(np.array(chances) < 0.05) < 0.09
 
 
+def test_weights_make_no_reading_odd():
+    """Residuals times √β were judged: of 40 readings of weights from 0.1 to 10 one was odd in a fourth of the fits."""
+    rng = np.random.default_rng(4)
+    weights = np.exp(rng.normal(0, 1.5, K))
+    plain = designed()[0] / np.sqrt(47)
+    sensitivity = np.sqrt(47 * weights)[:, None] * plain
+    fitted = sensitivity @ np.linalg.solve(47 * np.eye(4) + sensitivity.T @ sensitivity, sensitivity.T)
+    found = []
+    for _ in range(300):
+        y = np.sqrt(weights) * (plain @ rng.standard_normal(4) + rng.standard_normal(K))
+        about = np.linspace(0, 1, K) ** 2, np.arange(K)
+        found.append(Residuals.of(y - fitted @ y, sensitivity, 47, *about, weights=weights))
+    drawn = np.array([r.white for r in found])
+    assert np.mean(drawn**2, axis=0) == pytest.approx(np.diag(found[0].expected), rel=0.35)
+    size = np.array([r.studentised for r in found])
+    told = np.flatnonzero(size[0] != 0)
+    assert np.mean(size[:, told] ** 2) == pytest.approx(1, abs=0.06)
+    for chances in ([r.lag_one_chance for r in found], [r.collapse_chance for r in found]):
+        assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 300))
+    assert np.mean([r.outlier[1] < 0.05 for r in found]) < 0.09
+
+
 def test_imhof_of_few_numbers():
     assert positive_chance(np.array([1.0, -1.0])) == pytest.approx(0.5, abs=1e-6)
     assert positive_chance(np.array([1.0, 1.0, -1.0])) == pytest.approx(np.sqrt(0.5), abs=1e-4)

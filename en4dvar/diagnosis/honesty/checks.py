@@ -95,7 +95,7 @@ def structure(analysis: Analysis) -> Findings:
             "the model is right): the error bars assume independent errors"
         )
         # what is missed moves an estimate by no more than |e| of its standard deviations
-        small = float(residuals.white @ residuals.white) < 1
+        small = float(np.sum((1.0 if residuals.weights is None else residuals.weights) * residuals.white**2)) < 1
         yield caution("residual-structure", words, "caution" if small else None)
     if residuals.collapse_chance < ODD:
         words = (
