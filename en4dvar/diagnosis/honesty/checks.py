@@ -123,12 +123,13 @@ def missed(analysis: Analysis) -> Findings:
     names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
     if amplitude is None or amplitude.name not in names:
         return
-    low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
+    members = analysis.posterior[:, names.index(amplitude.name)]
+    low, told = np.nanquantile(members, NINE_OF_TEN[0]), diag.member_quantiles(members, NINE_OF_TEN)
     error, part = float(np.median(analysis.own_std)), analysis.problem.parts[0].where
     if not low > THERE * error:
         return
     signal = float(np.std(analysis.observations.values[part][analysis.observations.weights[part] > 0]))
-    by = f"by {shown(low, amplitude)} to {shown(high, amplitude)} (standard deviation of the discrepancy, 5 to 95 %)"
+    by = f"by {' to '.join(shown(end, amplitude) for end in told)} (standard deviation of the discrepancy, 5 to 95 %)"
     if low > NOTHING * signal:
         words = (
             f"the model explains little: it misses the readings {by}, while these vary by {shown(signal, amplitude)}"
