@@ -120,6 +120,8 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     expected = f"expected are {plain_number(low / n_observations, 2)} to {plain_number(high / n_observations, 2)}"
     if chi2 * n_observations > high:
         return f"misfit exceeds the stated noise: model or noise is wrong; {expected}", True
+    if n_observations - dfs <= 1:
+        return "misfit tells nothing of the noise: the fit determines about as many numbers as it has readings", False
     if chi2 * n_observations < low:
         return f"misfit is below the stated noise, which may be overstated; {expected}", True
     if structured:

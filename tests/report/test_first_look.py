@@ -15,7 +15,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.report.figures import histograms, neighbours
-from en4dvar.report.page import render_set, trust
+from en4dvar.report.page import judge_chi2, render_set, trust
 from en4dvar.report.result import Result
 from en4dvar.results.scalars import SAMPLE_STATS
 
@@ -167,3 +167,13 @@ def test_the_band_of_neighbours_holds_19_of_20_independent_series():
     rng = np.random.default_rng(3)
     outside = [abs(c[0]) > limit for c, limit in (neighbours(rng.standard_normal(100)) for _ in range(2000))]
     assert np.mean(outside) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize("chi2", [4e-8, 1.0])
+def test_a_fit_of_as_many_numbers_as_readings_tells_nothing_of_the_noise(chi2):
+    """The page of one reading, of which one number is estimated, said that its noise may be overstated."""
+    assert judge_chi2(chi2, 1, 0.999999) == (
+        "misfit tells nothing of the noise: the fit determines about as many numbers as it has readings",
+        False,
+    )
+    assert judge_chi2(30.0, 1, 0.999999)[1]
