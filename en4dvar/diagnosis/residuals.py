@@ -8,6 +8,13 @@ absorbed a part of the noise. In the linear Gaussian case they are N(0, Q),
 so that a ratio eᵀFe/eᵀe, which knows no scale, exceeds what was found with the probability that a quadratic form of
 known eigenvalues is positive (Imhof 1961, Biometrika 48, 419; Durbin & Watson 1971, ibid. 58, 1). The diagonal of I − Q
 is the leverage of each reading: the share of itself in its own prediction.
+
+Readings of weights W = diag(β) pull the fit more or less than their errors do, but err by these. With the rows of S and
+what they absorbed, P = S A⁻¹ Sᵀ, times √β as J has them, residuals in the readings' own errors have
+
+    Q = (I − B)(I − B)ᵀ + W^(−½) (P − P²) W^(−½),     B = W^(−½) P W^½,
+
+which is I − P where all weights are one.
 """
 
 import math
@@ -24,16 +31,20 @@ ROUNDING = 1e-3  # standard deviations: residuals of which none is larger are th
 FITTED = 0.005  # of the leverage of a reading: what less leaves of its residual is the error of the linearisation
 NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
 OF_ERRORS = 0.5  # of the variance of the readings in a direction, beyond which it is of their errors, not of the prior
-FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
+EVEN = np.linspace(0.0, math.log1p(1e10), 1001)  # of ln (1 + u): with few weights the integrand falls slowly
+FREQUENCIES = np.expm1(EVEN)
+SIMPSON = EVEN[1] / 3 * (1 + FREQUENCIES) * np.concatenate([[1], np.tile([4, 2], 500)[:-1], [1]])
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of the K readings that count: whitened ``white`` e (K,), what the fit ``absorbed`` of their noise,
-    L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there, of several series in units of their
-    errors. ``which`` (K,) are their places in the data; ``series`` (K,) labels those among which neighbours follow each
-    other in time. ``dfs``: degrees of freedom for signal of all readings. ``freedom``: ν, where the size of
-    the errors is estimated, of the inverse χ² that its square has in the posterior; e is that of its geometric mean.
+    """Residuals of the K readings that count: whitened ``white`` e (K,), in their own errors, what the fit ``absorbed``
+    of their noise, L (K, r) with P = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there, of several series in
+    units of their errors. ``which`` (K,) are their places in the data; ``series`` (K,) labels those among which
+    neighbours follow each other in time. ``dfs``: degrees of freedom for signal of all readings. ``freedom``: ν, where
+    the size of the errors is estimated, of the inverse χ² that its square has in the posterior; e is that of its
+    geometric mean.
+    ``weights`` β (K,); None where all are one.
     """
 
     white: Array
@@ -43,6 +54,7 @@ class Residuals:
     series: Indices
     dfs: float
     freedom: float | None = None
+    weights: Array | None = None
 
     @classmethod
     def of(
@@ -54,9 +66,10 @@ class Residuals:
         which: Indices,
         series: Indices | None = None,
         freedom: float | None = None,
+        weights: Array | None = None,
     ) -> "Residuals":
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1. ``white`` (K',) and
-        ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
+        ``sensitivity`` (K'', r) are those of the observations, times √β, and, below, of what moves R.
         """
         k = len(speed)
         prior = math.sqrt(prior_precision) * np.eye(sensitivity.shape[1])
@@ -64,7 +77,9 @@ class Residuals:
         absorbed = np.linalg.qr(np.vstack([sensitivity, prior]))[0][: len(sensitivity)]
         labels = np.zeros(k, dtype=np.intp) if series is None else series
         dfs = float(np.sum(absorbed**2))
-        return cls(white[:k][which], absorbed[which], speed[which], which, labels[which], dfs, freedom)
+        own = None if weights is None or np.all(weights[which] == 1) else weights[which]
+        e = white[:k][which] / (1.0 if own is None else np.sqrt(own))
+        return cls(e, absorbed[which], speed[which], which, labels[which], dfs, freedom, own)
 
     @cached_property
     def leverage(self) -> Array:
@@ -74,12 +89,21 @@ class Residuals:
     @cached_property
     def expected(self) -> Array:
         """Q (K, K); of many readings it would fill the memory."""
-        return np.eye(len(self.white)) - self.absorbed @ self.absorbed.T
+        absorbed = self.absorbed @ self.absorbed.T
+        if self.weights is None:
+            return np.eye(len(self.white)) - absorbed
+        root = np.sqrt(self.weights)
+        left = np.eye(len(root)) - absorbed * (root / root[:, None])
+        return np.asarray(left @ left.T + (absorbed - absorbed @ absorbed) / np.outer(root, root))
 
     @cached_property
     def studentised(self) -> Array:
         """Residuals (K,) over their own expected std; 0 of a reading that only its own prediction is fitted to."""
         left = 1 - self.leverage
+        if self.weights is not None:  # the diagonal of Q
+            L = self.absorbed
+            mixed = L.T @ (self.weights[:, None] * L) - L.T @ L
+            left = left - self.leverage + (self.leverage + np.sum(L @ mixed * L, axis=1)) / self.weights
         return np.where(left > FITTED, self.white / np.sqrt(np.maximum(left, FITTED)), 0.0)
 
     @property
@@ -174,10 +198,9 @@ def positive_chance(weights: Array) -> float:
     >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
     (0.5, 0.7071)
     """
-    scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u
-    u = FREQUENCIES
+    scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u where weights are many
+    u = FREQUENCIES[1:]
     angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)
     fall = np.exp(-0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
-    integrand = np.sin(angle) * fall / u
-    area = float(np.trapezoid(integrand, u)) + float(u[0]) * 0.5 * float(scaled.sum())
+    area = float(SIMPSON[0] * 0.5 * scaled.sum() + SIMPSON[1:] @ (np.sin(angle) * fall / u))
     return min(1.0, max(0.0, 0.5 + area / math.pi))

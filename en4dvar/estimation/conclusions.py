@@ -165,7 +165,8 @@ def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | Non
     for part in space.problem.parts:
         if part.has_path:
             labels[part.where] = part.begin
-    return Residuals.of(white, sensitivity, precision, speed, observations.used, labels, freedom)
+    about = observations.used, labels, freedom, observations.weights
+    return Residuals.of(white, sensitivity, precision, speed, *about)
 
 
 def timing_of(problem: InverseProblem, at: Predicted) -> float:

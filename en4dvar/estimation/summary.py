@@ -100,7 +100,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     parameter beyond its error bar.
     """
     used = len(a.problem.observations.used)
-    excluded = {s.name: exclusion(a.fit[0], used, s.cost_change) for s in a.what_if}
+    excluded = {s.name: exclusion(a.fit[0], used, s.misfit_change) for s in a.what_if}
     large = [shift for shift in a.what_if if shift.exceeds and not excluded[shift.name]]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)

@@ -103,8 +103,9 @@ LEVEL = 0.01  # of the tests of all quantities together, by Holm's rule
 APART = 0.2  # mean of z by which what is off is told
 CURVES = (
     "Share of the sets whose truth has a lower rank among the members, less that of uniform ranks. A calibrated "
-    f"posterior stays within the band, {100 * BAND:.0f} of 100 times throughout. A curve that rises and falls: its "
-    "intervals are too wide; that falls and rises: too narrow; above: its values are too high; below: too low."
+    f"posterior stays within the band, {100 * BAND:.0f} of 100 times throughout. A curve that is first below, then "
+    "above: its intervals are too wide; first above, then below: too narrow; above: its values are too high; below: "
+    "too low."
 )
 HEAD = ("quantity", "sets", "p of uniform ranks", "mean of z", "std of z", "50 % intervals hold", "90 % intervals hold")
 

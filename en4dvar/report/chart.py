@@ -20,6 +20,7 @@ from en4dvar.report.text import plain_number
 Kind = Literal["line", "dots", "rings", "ticks", "dashes", "band", "bars", "rule", "upright", "span", "tiles"]
 POINTS = 72 / 2.54  # a centimetre
 COLUMN, PAGE = 8.5 * POINTS, 17.5 * POINTS  # one journal column, and two
+SAME = 1e-12  # of their size: values that differ by less are not divided into bins
 Values = npt.ArrayLike
 
 
@@ -115,8 +116,8 @@ class Panel:
         self._add("span", (), (low,), (high,), colour, 0.0, alpha=alpha)
 
     def histogram(self, values: Array, colour: str, alpha: float) -> None:
-        """Scaled to its peak; values that do not differ are a line."""
-        if values.size < 2 or np.ptp(values) == 0:
+        """Scaled to its peak; values that do not differ, but for rounding, are a line."""
+        if values.size < 2 or np.ptp(values) <= SAME * np.abs(values).max():
             for value in values[:1]:
                 self.upright(float(value), colour, 2.0, alpha=alpha)
             return
@@ -266,12 +267,13 @@ def powers(low: float, high: float) -> list[float]:
 
 
 def numbers(values: Sequence[float]) -> list[str]:
-    """Ticks as text, all with the same decimals."""
+    """Ticks as text, all with the same decimals; no two that differ look the same."""
     size = max(map(abs, values), default=0.0)
     step = min((abs(b - a) for a, b in pairwise(values)), default=size)
     if (size and not 1e-3 <= size < 1e5) or step <= 0:
-        return [plain_number(v, 3) for v in values]
-    places = next((n for n in range(7) if all(abs(v - round(v, n)) < 1e-6 * step for v in values)), 7)
+        digits = next((n for n in range(3, 15) if all(abs(v - float(f"{v:.{n}g}")) < 1e-6 * step for v in values)), 15)
+        return [plain_number(v, digits if step > 0 else 3) for v in values]
+    places = next((n for n in range(13) if all(abs(v - round(v, n)) < 1e-6 * step for v in values)), 13)
     return [f"{v:.{places}f}".replace("-", "−") if round(v, places) else "0" for v in values]
 
 

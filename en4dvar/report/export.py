@@ -32,6 +32,7 @@ _COMMANDS = (
 _FORMULA = re.compile(rf"\$(?:[A-Za-z0-9_^{{}}()\[\],.+\-*/=' <>|]|\\(?:{_COMMANDS})(?![A-Za-z])|\\[,;:! ])+\$")
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+_ESCAPES |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}  # other signs in the font of old
 _SIGNS = {
     "²": "^2", "³": "^3", "±": r"\pm", "×": r"\times", "−": "-", "→": r"\to", "≤": r"\le", "≥": r"\ge", "≈": r"\approx",
     "√": r"\surd", "°": r"^\circ", "µ": r"\mu", "Ṙ": r"\dot R",
@@ -133,8 +134,13 @@ class Notes(dict[str, str]):
         return self._marks([c.words for c in cautions if not c.parameters and c.kind == "warning"])
 
     def _marks(self, each: Sequence[str]) -> str:
-        letters = [self.setdefault(words, string.ascii_lowercase[len(self) % 26]) for words in each if words]
+        letters = [self.setdefault(words, self._next()) for words in each if words]
         return f"\\textsuperscript{{{','.join(letters)}}}" if letters else ""
+
+    def _next(self) -> str:
+        """``a`` … ``z``, then ``aa``, ``ab``, …"""
+        rounds, letter = divmod(len(self), 26)
+        return (string.ascii_lowercase[rounds - 1] if rounds else "") + string.ascii_lowercase[letter]
 
 
 def _one_set(dataset: Found, notes: Notes) -> tuple[list[str], list[list[str]]]:

@@ -120,7 +120,7 @@ def traces(result: StoredResult) -> Chart:
         members, centre = (shown(held[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
-            low, high = np.quantile(members[:, alive], (0.16, 0.84), axis=1)  # of what is positive, positive
+            low, high = member_quantiles(members[:, alive], (0.16, 0.84), axis=1)  # of what is positive, positive
             panel.band(steps, low, high, "posterior", 0.3)
             panel.line(steps, members[:, alive].mean(axis=1), "posterior")
         panel.line(steps, centre, "centre", 0.9, "--")

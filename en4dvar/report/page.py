@@ -15,6 +15,7 @@ import numpy as np
 
 from en4dvar.diagnosis.diagnostics import change_words, chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
+from en4dvar.diagnosis.residuals import MOST
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import ABOUT, Caution, codes, gravity, worst_first
 from en4dvar.report import responses
@@ -27,6 +28,7 @@ from en4dvar.report.text import figure_text, number_like, plain_number, pretty_u
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
+UNRELATED = (0.025, 0.975)  # chances of a correlation of neighbours of which nothing is said
 IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
@@ -90,12 +92,22 @@ def trust(result: StoredResult) -> str:
 
 
 def _neighbours_words(result: StoredResult) -> str:
-    """Whether neighbouring residuals are related more than independent errors are in 95 of 100 data sets."""
-    correlation, limit = neighbours(responses.whitened(result))
-    if not len(correlation) or abs(correlation[0]) <= limit:
-        return " and neighbouring residuals are unrelated" if len(correlation) else ""
-    alike = "resemble each other" if correlation[0] > 0 else "alternate in sign"
-    return f", but neighbouring residuals {alike} (correlation {plain_number(float(correlation[0]), 2)}): look at them"
+    """Whether neighbouring residuals are related more than those of a right model are in 95 of 100 data sets."""
+    stats, white = result.group("sample_stats").attrs, responses.whitened(result)
+    if "residual_lag_one_chance" in stats:  # a fit makes neighbours of few readings alternate
+        correlation, chance = float(stats["residual_lag_one"]), float(stats["residual_lag_one_chance"])
+    elif len(white) > MOST:
+        correlation = float(neighbours(white)[0][0])
+        chance = 0.5 * math.erfc(correlation * math.sqrt(len(white) / 2))
+    else:
+        return ""
+    if not correlation:  # no reading follows another
+        return ""
+    if UNRELATED[0] <= chance <= UNRELATED[1]:
+        return " and neighbouring residuals are unrelated"
+    alike = "resemble each other" if chance < 0.5 else "alternate in sign"
+    more = f"more than chance explains (correlation {plain_number(correlation, 2)})"
+    return f", but neighbouring residuals {alike} {more}: look at them"
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
@@ -108,6 +120,8 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     expected = f"expected are {plain_number(low / n_observations, 2)} to {plain_number(high / n_observations, 2)}"
     if chi2 * n_observations > high:
         return f"misfit exceeds the stated noise: model or noise is wrong; {expected}", True
+    if n_observations - dfs <= 1:
+        return "misfit tells nothing of the noise: the fit determines about as many numbers as it has readings", False
     if chi2 * n_observations < low:
         return f"misfit is below the stated noise, which may be overstated; {expected}", True
     if structured:

@@ -337,9 +337,9 @@ def _sentence(d: Difference, names: Names = NAMES) -> str:
 def _line_words(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
     unit = unit_behind(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
-    rising = float(np.mean(of_it.slope > 0))
+    rising = np.clip(np.mean(of_it.slope > 0), 1 - SURE, SURE)
     by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)}{unit}"
-    words = f"grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
+    words = f"grows by {by} for each unit of the number; it rises with probability {rising:.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
         return f"{words}; they do not lie on a line (χ² {chi} of {of_it.freedom}), for which the interval is widened."

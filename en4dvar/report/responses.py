@@ -85,12 +85,15 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
         return ()
     keys = "words", "cost_change", "reason", "change", "relative_change", "change_in_std"
     words, cost, reason, change, relative, in_std = (stats.variables[f"what_if_{key}"].values for key in keys)
+    of_before = stats.variables["what_if_cost_change"]  # of files of earlier versions, which do not know its parts
+    misfit = stats.variables.get("what_if_misfit_change", of_before).values
     chi2, readings = float(stats.attrs["chi2_per_observation"]), int(stats.attrs["n_weighted"])
 
     def shift(i: int, j: int, name: str, v: Variable) -> StoredShift:
         known = str(stats.coords["alternative"].values[i]), str(words[i]), name, v.attrs["display_units"]
         numbers = float(shown(v, change[i, j])), float(relative[i, j]), float(in_std[i, j]), float(cost[i])
-        return StoredShift(*known, *numbers, str(reason[i]), v.attrs["symbol"], exclusion(chi2, readings, numbers[-1]))
+        excluded = exclusion(chi2, readings, float(misfit[i]))
+        return StoredShift(*known, *numbers, str(reason[i]), v.attrs["symbol"], excluded)
 
     order = np.argsort(-np.where(reason == "", np.abs(in_std).max(axis=1), 1.0), kind="stable").tolist()
     return tuple(tuple(shift(i, j, *p) for j, p in enumerate(result.parameters.items())) for i in order)

@@ -71,11 +71,10 @@ def span_of(time: Array) -> tuple[float, float] | None:
     return (float(time[0]), float(time[-1])) if time[-1] > time[0] else None
 
 
-def ranks(ranked: Array, members: int) -> Chart:
+def ranks(ranked: Array) -> Chart:
     """The rank histogram of all observations, with the band that holds 95 % of the bars of a reliable ensemble."""
     known = ranked[np.isfinite(ranked)]
-    placed = (members * known + 0.5) / (members + 1)  # of the N + 1 places among N members
-    counts, edges = np.histogram(placed, BINS, (0, 1))
+    counts, edges = np.histogram(known, BINS, (0, 1))
     low, high = binom.ppf([0.025, 0.975], len(known), 1 / BINS) / max(1, len(known))
     shares = counts / max(1, len(known))
     panel = Panel("rank of the observation, 0 to 1", f"share of {len(known)}", xlim=(0.0, 1.0))
@@ -216,7 +215,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
         yield "parameters", caption, in_time(data, "analysis", held[:SHOWN])
     caption = "Innovations, the readings minus their forecasts, within two of their expected standard deviations."
     yield "innovations", caption, innovations(data)
-    yield "ranks", RANKS, ranks(data["rank"].values, int(data.attrs["members"]))
+    yield "ranks", RANKS, ranks(data["rank"].values)
 
 
 def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
@@ -400,7 +399,7 @@ def twin_figures(data: Group) -> Iterator[Captioned]:
     words = f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread."
     lies = "A reliable ensemble lies on the diagonal: where it is spread wide, its error is large."
     yield "reliability", f"{words} {lies}", reliability(data)
-    yield "ranks", RANKS, ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
+    yield "ranks", RANKS, ranks(data["rank"].values[burn_in:])
 
 
 def scores(data: Group) -> Chart:

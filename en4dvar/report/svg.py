@@ -244,7 +244,7 @@ def path_of(mark: Mark, place: Frame) -> str:
     far, base = place.x + place.width, place.y + place.height
     filled = mark.kind in ("band", "span", "tiles")
     if mark.kind == "line":
-        edges = _line(*_thinned(x, y))
+        edges = "".join(_line(*_thinned(u, v)) for u, v in _unbroken(x, y))
     elif mark.kind == "band":
         seen = np.isfinite(x) & np.isfinite(y) & np.isfinite(top)
         (u, v), (w, z) = _thinned(x[seen], y[seen]), _thinned(x[seen], top[seen])
@@ -291,24 +291,20 @@ def _each(x: Array, y: Array, strokes: Sequence[str]) -> str:
 
 
 def _line(x: Array, y: Array) -> str:
-    """A path through what is finite, anew behind each gap."""
-    parts, letter = [], "M"
-    for u, v in zip(x.tolist(), y.tolist(), strict=True):
-        there = math.isfinite(u) and math.isfinite(v)
-        if there:
-            parts.append(f"{letter}{u:.1f} {v:.1f}")
-        letter = "L" if there else "M"
-    return "".join(parts)
+    return "".join(f"{'L' if i else 'M'}{u:.1f} {v:.1f}" for i, (u, v) in enumerate(zip(x, y, strict=True)))
+
+
+def _unbroken(x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
+    """The parts of a line between its gaps, where it is not finite."""
+    there = np.isfinite(x) & np.isfinite(y)
+    edges = np.flatnonzero(np.diff(np.pad(there, 1).astype(int)))
+    return ((x[begin:end], y[begin:end]) for begin, end in edges.reshape(-1, 2))
 
 
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """At most :data:`SHOWN` points: of each part of many points the least and the greatest."""
+    """At most :data:`SHOWN` finite points: of each part of many points the least and the greatest."""
     if len(x) <= SHOWN:
         return x, y
-    kept = set()
-    for part in np.array_split(np.arange(len(x)), SHOWN // 2):
-        known = part[np.isfinite(y[part])]
-        if known.size:
-            kept |= {int(known[np.argmin(y[known])]), int(known[np.argmax(y[known])])}
-    order = sorted(kept)
+    parts = np.array_split(np.arange(len(x)), SHOWN // 2)
+    order = sorted({int(part[place(y[part])]) for part in parts for place in (np.argmin, np.argmax)})
     return x[order], y[order]

@@ -73,7 +73,7 @@ SERIES: Table = (
     Declared("predicted_std", OBSERVATION, "standard deviation of that forecast", lambda r: r.run.predicted.std, BARE),
     Declared("normalised_innovation", OBSERVATION, "innovation over its expected standard deviation",
              lambda r: normalised_innovations(_series(r), r.run)),
-    Declared("rank", OBSERVATION, "share of forecast members, observation errors added, below the observation",
+    Declared("rank", OBSERVATION, "place of the observation among forecast members, observation errors added, 0 to 1",
              lambda r: r.run.ranks),
 )  # fmt: skip
 MOMENTS: Table = (

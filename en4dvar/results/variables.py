@@ -339,6 +339,7 @@ WHAT_IF = (
     _what_if("what_if_relative_change", "alternative parameter", "relative", "the same relative to the centre"),
     _what_if("what_if_change_in_std", "alternative parameter", "in_std", "the same in posterior standard deviations"),
     _what_if("what_if_cost_change", "alternative", "cost_change", "change of J"),
+    _what_if("what_if_misfit_change", "alternative", "misfit_change", "change of the readings' part of J"),
     _what_if("what_if_runs_each", "alternative", "runs", "forward runs it took"),
     _what_if("what_if_reason", "alternative", "reason", "why it cannot be told"),
 )  # fmt: skip

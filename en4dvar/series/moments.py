@@ -9,6 +9,7 @@ from en4dvar.data.noise import Correlation
 from en4dvar.data.noise.discrepancy import whitened
 from en4dvar.model.state import Array
 from en4dvar.plumbing.moved import former_name
+from en4dvar.priors.prior import member_stream
 from en4dvar.series.series import CycleSeries
 
 BLOCK = 64  # ensembles kept until their moments are taken, at most
@@ -89,8 +90,9 @@ class MomentsRecorder:
 class InnovationRecorder(MomentsRecorder):
     """Moments of predictions (N, p) of a series; and of its observations (K, p) ranks and, ``of_data``, evidence (K,).
 
-    A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
-    share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
+    A rank is the place of the observation among the N members, each with an error of the observations of its own,
+    counted from a random number between 0 and 1 and divided by N + 1: of a reliable ensemble it is uniform, as the mean
+    over these errors is not, whose ends are rare. NaN where there is none. Random numbers are those of the cycle.
 
     ``ranks`` and ``evidence`` are those of everything recorded so far once :meth:`moments` has been asked for.
     """
@@ -107,8 +109,6 @@ class InnovationRecorder(MomentsRecorder):
     def _flush(self) -> None:
         if not self._cycles:
             return
-        from scipy.special import ndtr
-
         at = list(self._cycles)
         super()._flush()
         gaps = self._ensembles[: len(at)]  # the members are not needed any more: memory is not asked for again
@@ -116,7 +116,11 @@ class InnovationRecorder(MomentsRecorder):
         gaps /= self._std[at][:, None]
         if self._of_data:
             self.evidence[at] = log_evidence(gaps, self._std[at], self._series.correlation)
-        self.ranks[at] = ndtr(gaps, out=gaps).mean(axis=1)
+        for cycle, gap in zip(at, gaps, strict=True):
+            stream = member_stream(0, "ranks", cycle)
+            below = np.count_nonzero(stream.standard_normal(gap.shape) < gap, axis=0)
+            place = (below + stream.random(len(below))) / (len(gap) + 1)
+            self.ranks[cycle] = np.where(np.isfinite(gap[0]), place, np.nan)
 
 
 def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Array:
@@ -150,8 +154,8 @@ class SequentialState:
     """What a run has found so far: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
     The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
-    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
-    the errors of the observations, that lie below the observation, NaN where there was none. ``evidence`` (K,): log
+    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): place of the observation
+    among the members with errors of the observations, 0 to 1, NaN where there was none. ``evidence`` (K,): log
     density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
     ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
     leave, NaN: all. ``members`` (N', n + changes of what varies) at the ``start`` of the window (0: time zero, k:

@@ -122,7 +122,17 @@ def test_a_skewed_posterior_stands_as_its_median_with_unequal_sides(analysis: An
     assert r"\textsuperscript{a} it is the prior's" in latex_table([("x", (even,), (about,))])
 
 
+def test_each_footnote_has_letters_of_its_own(analysis: Analysis) -> None:
+    """The 27th note was an a, as the first is."""
+    rows = Posterior.from_analysis(analysis, {}).rows
+    table = latex_table([(f"gel {i}", rows, (caution("misfit", f"off by {i}"),)) for i in range(60)])
+    notes = re.findall(r"textsuperscript\{(\w+)\} off by (\d+)", table)
+    assert len(notes) == len(dict(notes)) == 60
+    assert all(rf"gel {i}\textsuperscript{{{letters}}}" in table for letters, i in notes)
+
+
 def test_what_latex_would_not_print_is_escaped() -> None:
+    assert escaped("G < 1 | > 2") == r"G \textless{} 1 \textbar{} \textgreater{} 2"
     assert escaped(r"50 % of_{a}\b") == r"50 \% of\_\{a\}\textbackslash{}b"
     assert escaped("χ² is −1 ± 2 µm – less …") == r"$\chi$$^2$ is $-$1 $\pm$ 2 $\mu$m -- less \dots{}"
     assert latex_unit("J/m^2") == r"J/m$^{2}$"

@@ -29,6 +29,7 @@ from toys import Vectorised, Wave, make_observations, make_problem, with_discrep
 
 from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.honesty.advice import ADVICE, Case
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative, ValidityLimit
@@ -241,6 +242,22 @@ def test_a_window_that_ends_before_the_model_leaves_its_validity_is_named():
     to = float(re.search(r"data\.window: \{to: ([\d.]+) s\}", c.advice)[1])
     assert problem.observations.times[0] < to < problem.observations.times[-1]
     assert told(follow(a, c, None), "model-validity") is None
+
+
+def test_members_that_failed_leave_the_window_in_which_the_model_is_valid():
+    """Of a failed member it is not known when it leaves; the advice said that no reading comes before."""
+    problem = make_problem(Late(TWO), (1.0, -0.6), std=0.01, k=18)
+    a, c = run(problem), told(run(problem), "model-validity")
+    failures, beyond = ("lost", *a.posterior_failures[1:]), np.vstack([np.full((1, 1), np.nan), a.beyond[1:]])
+    case = Case(replace(a, posterior_failures=failures, beyond=beyond), c, frozenset({c.code}))
+    assert ADVICE["model-validity"](case) == c.advice
+
+
+def test_the_error_that_is_advised_is_as_sharp_as_the_readings_tell_it():
+    """Of 5000 readings it advised to state 0.1 m where 0.1 m was stated."""
+    a = run(replace_std(make_problem(Vectorised(TWO), (1.0, 0.5), k=5000, std=0.104), 0.1))
+    c = told(a, "misfit")
+    assert told(follow(a, c, None), "misfit") is None
 
 
 def test_a_window_is_ended_on_the_clock_of_the_data():

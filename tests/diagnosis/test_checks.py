@@ -19,6 +19,7 @@ from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.report.result import Result
 from en4dvar.results.store import StoredResult
 
 G, R0 = Parameter("G", "Pa", bounds=(0.0, np.inf), display_unit="kPa"), Parameter("R0", "m", display_unit="um")
@@ -297,6 +298,14 @@ def test_a_discrepancy_on_which_no_estimate_depends_is_a_note(share, severity):
     (told,) = missed(replace(analysis, discrepancy=replace(analysis.discrepancy, shares=shares)))
     assert told.severity == severity
     assert ("at most 9 % of the variance" in told.words) == (severity == "note")
+
+
+def test_the_interval_of_a_warning_is_that_of_the_table():
+    """It said 0.0784 to 0.174 where the table has 0.0764 to 0.177."""
+    analysis = run(waved(3.0))
+    (row,) = (row for row in Result.from_analysis(analysis, {}).rows if row.name == "discrepancy_amplitude")
+    (told,) = missed(analysis)
+    assert f"by {row.q05:.3g} m to {row.q95:.3g} m (standard deviation" in told.words
 
 
 def test_a_discrepancy_is_measured_by_the_errors_of_the_readings_not_by_what_it_makes_of_them():

@@ -11,13 +11,15 @@ from toys import Decay, Linear, Wave, make_problem, with_discrepancy, with_noise
 
 from en4dvar.diagnosis.response.budget import ASSUMED, budget
 from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, changed_problem
-from en4dvar.ensemble.forecast import cost
+from en4dvar.ensemble.forecast import Composite, cost
 from en4dvar.estimation.assimilate import _fitted, assimilate
 from en4dvar.estimation.stages import Stages
 from en4dvar.estimation.summary import remarks
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Alternative, Failure
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.report.responses import stored_shifts
+from en4dvar.report.result import Result
 from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS = AssimilationSettings(members=12)
@@ -248,7 +250,30 @@ def test_the_posterior_is_the_same_and_its_runs_are_counted():
     assert line.startswith("what if …: ")
     assert "std)" in line
     far = offering(plain, Alternative("offset", "…", Offset(5.0)))
-    assert "the readings exclude it: χ² is 1670 for 9 readings" in remarks(assimilate(far, SETTINGS, 3))[0]
+    (words, *_) = remarks(assimilate(far, SETTINGS, 3))
+    assert f"the readings exclude it: χ² is {chi2_with(far):.0f} for 9 readings" in words
+
+
+def chi2_with(problem):
+    """χ² of the readings at the mode of the only alternative of a linear problem."""
+    (alternative,) = problem.model.alternatives
+    changed = changed_problem(problem, alternative)
+    mode = problem.prior.from_physical(assimilate(replace(problem, model=Linear(("a", "b"))), SETTINGS, 3).centre)
+    shift = shift_of(problem, 3)
+    predicted = Composite(changed, SerialExecutor())((mode + shift.change)[None]).predicted[0]
+    return 2 * float(changed.observations.cost(predicted))
+
+
+def test_what_the_prior_speaks_against_is_not_excluded_by_the_readings():
+    """A scale that is 30 % off, with a and b known to 0.05: χ² is 8 of 9 readings, and 107 was told."""
+    problem = make_problem(Linear(("a", "b")), [1.0, 0.5], scale=0.05, std=0.02)
+    offering(problem, Alternative("scale", "the scale were off", values=1.3))
+    a = assimilate(problem, SETTINGS, 3)
+    assert chi2_with(problem) < 9 < 100 < 2 * a.what_if[0].cost_change
+    assert a.fit[0] * 9 + 2 * a.what_if[0].misfit_change == pytest.approx(chi2_with(problem), rel=1e-6)
+    assert "exclude" not in " ".join(remarks(a))
+    rows = [row[0] for row in stored_shifts(Result.from_analysis(a, {}))]
+    assert [(row.excluded, row.exceeds) for row in rows] == [("", True)]
 
 
 def test_the_shifts_are_added_to_the_covariance_and_the_mean_stays():

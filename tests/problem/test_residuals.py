@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import bent, run, spiked
-from scipy.special import digamma, fdtrc
+from scipy.special import digamma, fdtrc, fdtri
 from toys import with_discrepancy
 
 from en4dvar.diagnosis.residuals import Residuals, positive_chance
@@ -37,6 +37,28 @@ def test_chances_are_uniform_where_the_model_is_right():
         assert np.mean(np.array(chances) < 0.05) < 0.09
 
 
+def test_weights_make_no_reading_odd():
+    """Residuals times √β were judged: of 40 readings of weights from 0.1 to 10 one was odd in a fourth of the fits."""
+    rng = np.random.default_rng(4)
+    weights = np.exp(rng.normal(0, 1.5, K))
+    plain = designed()[0] / np.sqrt(47)
+    sensitivity = np.sqrt(47 * weights)[:, None] * plain
+    fitted = sensitivity @ np.linalg.solve(47 * np.eye(4) + sensitivity.T @ sensitivity, sensitivity.T)
+    found = []
+    for _ in range(300):
+        y = np.sqrt(weights) * (plain @ rng.standard_normal(4) + rng.standard_normal(K))
+        about = np.linspace(0, 1, K) ** 2, np.arange(K)
+        found.append(Residuals.of(y - fitted @ y, sensitivity, 47, *about, weights=weights))
+    drawn = np.array([r.white for r in found])
+    assert np.mean(drawn**2, axis=0) == pytest.approx(np.diag(found[0].expected), rel=0.35)
+    size = np.array([r.studentised for r in found])
+    told = np.flatnonzero(size[0] != 0)
+    assert np.mean(size[:, told] ** 2) == pytest.approx(1, abs=0.06)
+    for chances in ([r.lag_one_chance for r in found], [r.collapse_chance for r in found]):
+        assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 300))
+    assert np.mean([r.outlier[1] < 0.05 for r in found]) < 0.09
+
+
 def test_imhof_of_few_numbers():
     assert positive_chance(np.array([1.0, -1.0])) == pytest.approx(0.5, abs=1e-6)
     assert positive_chance(np.array([1.0, 1.0, -1.0])) == pytest.approx(np.sqrt(0.5), abs=1e-4)
@@ -53,6 +75,15 @@ def test_imhof_against_draws():
 def test_imhof_against_the_distribution_of_a_ratio_of_squares(count, ratio):
     weights = np.repeat([1.0, -ratio], [count // 2, count - count // 2])
     assert positive_chance(weights) == pytest.approx(fdtrc(count / 2, count / 2, ratio), abs=1e-4)
+
+
+@pytest.mark.parametrize("chance", [1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("counts", [(2, 1), (3, 2), (8, 8), (2, 40), (250, 250)])
+def test_imhof_of_what_is_improbable(counts, chance):
+    """Below 1e-6 stood where it was 1e-5, and with two directions left no chance was below 0.02."""
+    more, less = counts
+    weights = np.repeat([1 / more, -fdtri(more, less, 1 - chance) / less], counts)
+    assert positive_chance(weights) == pytest.approx(chance, rel=0.02, abs=2e-6)
 
 
 def test_leverages_add_up_to_the_degrees_of_freedom():

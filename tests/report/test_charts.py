@@ -117,6 +117,27 @@ def test_gaps_stay_gaps_and_what_is_not_finite_is_not_drawn():
     assert not any(word in "".join(paths) for word in ("nan", "inf"))
 
 
+def test_gaps_stay_gaps_in_a_line_of_many_points():
+    """Intervals of 700 data sets were one line from each to the next."""
+    panel, n = Panel(), 700
+    panel.intervals(np.arange(n), np.arange(n) + 0.5, -np.arange(n), "ink")
+    _, _, (path,) = drawn(panel)
+    assert (path.count("M"), path.count("L")) == (n, n)
+
+
+def test_values_that_agree_to_rounding_are_a_line():
+    """Of a collapsed ensemble: no bins are that narrow."""
+    panel = Panel()
+    panel.histogram(np.array([1.0, 1.0 + 2.3e-16, 1.0]), "ink", alpha=1.0)
+    assert [mark.kind for mark in panel.marks] == ["upright"]
+
+
+@pytest.mark.parametrize("limits", [(101025, 101625), (1e7, 1.0001e7), (1.0001e-4, 1.0005e-4), (1.0, 1.0 + 1e-9)])
+def test_ticks_that_differ_have_numbers_that_differ(limits):
+    held = ticks(*limits, 5)
+    assert len(set(numbers(held))) == len(held) > 2
+
+
 def test_many_readings_stay_small_and_keep_their_extremes():
     x = np.arange(100_000.0)
     y = np.sin(x / 50)

@@ -10,12 +10,14 @@ import pytest
 from scipy.stats import lognorm, norm, uniform
 
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
+from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.report.figures import histograms, neighbours
-from en4dvar.report.page import render_set, trust
+from en4dvar.report.page import judge_chi2, render_set, trust
 from en4dvar.report.result import Result
+from en4dvar.results.scalars import SAMPLE_STATS
 
 JARGON = ("whitened", "leverage", "descent", "members alive", "DFS", "NRMSE", "χ²")
 
@@ -121,12 +123,16 @@ def test_a_reading_that_counts_less_is_told_where_else_nothing_is_wrong(analysis
     assert "But" not in trust(Result.from_analysis(replace(analysis, cautions=()), {}))
 
 
-def with_residuals(analysis, white):
-    result = Result.from_analysis(replace(analysis, cautions=()), {})
-    group = result.groups["/sample_stats"]
-    name = f"{result.observable}_whitened_residual"
-    variable = replace(group["dfs"], dims=(result.axes[0].time,), values=np.asarray(white))
-    return Result({**result.groups, "/sample_stats": replace(group, variables={**group.variables, name: variable})})
+def with_residuals(analysis, white, sensitivity=None):
+    """A result with these residuals of readings of such whitened sensitivities, those of none without."""
+    result, k = Result.from_analysis(replace(analysis, cautions=()), {}), len(white)
+    linear = np.zeros((k, 1)) if sensitivity is None else sensitivity
+    residuals = Residuals.of(np.asarray(white), linear, 47.0, np.ones(k), np.arange(k))
+    group, name = result.groups["/sample_stats"], f"{result.observable}_whitened_residual"
+    variables = {**group.variables, name: replace(group["dfs"], dims=(result.axes[0].time,), values=residuals.white)}
+    told = {a.name: a.value(replace(analysis, residuals=residuals)) for a in SAMPLE_STATS if "lag_one" in a.name}
+    attrs = {**group.attrs, **{name: value for name, value in told.items() if value is not None}}
+    return Result({**result.groups, "/sample_stats": replace(group, variables=variables, attrs=attrs)})
 
 
 def test_residuals_that_leave_their_band_are_not_called_unrelated(analysis):
@@ -134,16 +140,40 @@ def test_residuals_that_leave_their_band_are_not_called_unrelated(analysis):
     independent = np.random.default_rng(1).standard_normal(k)
     words = trust(with_residuals(analysis, independent))
     assert "unrelated" in words
-    alternating = independent + 2.0 * (-1.0) ** np.arange(k)
-    correlation, limit = neighbours(alternating)
-    assert correlation[0] < -limit
-    words = trust(with_residuals(analysis, alternating))
+    words = trust(with_residuals(analysis, independent + 2.0 * (-1.0) ** np.arange(k)))
     assert "unrelated" not in words
     assert "alternate in sign" in words
     assert "resemble each other" in trust(with_residuals(analysis, np.cumsum(independent)))
+
+
+def test_residuals_of_a_right_fit_are_called_odd_once_in_20(analysis):
+    """Of 10 readings a fit of 5 numbers leaves residuals that alternate: 38 of 100 right fits were to be looked at."""
+    rng, k = np.random.default_rng(5), 10
+    sensitivity = 20 * np.cos(np.pi * np.outer(np.linspace(0, 1, k), np.arange(5)))
+    gain = sensitivity @ np.linalg.solve(47 * np.eye(5) + sensitivity.T @ sensitivity, sensitivity.T)
+    odd = 0
+    for _ in range(80):
+        y = sensitivity @ rng.standard_normal(5) / 47**0.5 + rng.standard_normal(k)
+        odd += "unrelated" not in trust(with_residuals(analysis, y - gain @ y, sensitivity))
+    assert odd < 12  # of 4 expected: four standard deviations
+
+
+def test_nothing_is_said_of_neighbours_that_are_few_or_exact(analysis):
+    for white in (np.arange(7.0), 1e-5 * np.arange(40.0)):
+        assert "neighbouring" not in trust(with_residuals(analysis, white))
 
 
 def test_the_band_of_neighbours_holds_19_of_20_independent_series():
     rng = np.random.default_rng(3)
     outside = [abs(c[0]) > limit for c, limit in (neighbours(rng.standard_normal(100)) for _ in range(2000))]
     assert np.mean(outside) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize("chi2", [4e-8, 1.0])
+def test_a_fit_of_as_many_numbers_as_readings_tells_nothing_of_the_noise(chi2):
+    """The page of one reading, of which one number is estimated, said that its noise may be overstated."""
+    assert judge_chi2(chi2, 1, 0.999999) == (
+        "misfit tells nothing of the noise: the fit determines about as many numbers as it has readings",
+        False,
+    )
+    assert judge_chi2(30.0, 1, 0.999999)[1]

@@ -16,6 +16,7 @@ from toy_config import csv_text
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
+from en4dvar.estimation.population.contrast import StraightLine
 from en4dvar.inputs.members import read_members
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.report.populations import (
@@ -245,6 +246,15 @@ def test_words_of_a_difference():
     )
     assert _sentence(shift).startswith("G of a is 5.00 (4.00 … 6.00) kPa less than that of b; it is smaller with")
     assert _sentence(shift).endswith("not to be trusted: chain-not-converged.")
+
+
+@pytest.mark.parametrize(("sign", "chance"), [(1, "0.999"), (-1, "0.001")])
+def test_a_trend_is_no_surer_downwards_than_upwards(gels, sign, chance):
+    """No number of draws says more than 0.999 of a rise; of a fall it said 0.000."""
+    of = compare_populations(only(gels))
+    slope = sign * np.linspace(1.0, 2.0, 50)
+    of = replace(of, lines={"k": StraightLine(slope, slope, 0.0, 0)})
+    assert any(f"it rises with probability {chance}" in words for words in sentences(of))
 
 
 def test_a_page_writes_parameters_by_their_symbols_and_the_terminal_by_their_names(gels):

@@ -15,11 +15,14 @@ from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.report.sequence import ranks
 from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
+from en4dvar.series.moments import InnovationRecorder
 from en4dvar.series.sequential import SequentialSettings, run_sequential
+from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import Inflation
 from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
@@ -74,6 +77,27 @@ def test_what_is_observed():
     assert [o.name for o in experiment.observables] == ["x", "z"]
     assert series.std.tolist() == [0.1, 0.5]
     assert np.std(series.values - truth[:, [0, 2]], axis=0) == pytest.approx([0.1, 0.5], rel=0.15)
+
+
+@pytest.mark.parametrize("spread", [0.05, 1.0, 20.0])
+def test_a_reliable_ensemble_has_flat_ranks(spread):
+    """Of 10 members in place of 95 % of the bars none lay in the band, and the ends were 6 % in place of 10 %."""
+    rng = np.random.default_rng(5)
+    forecasts, truth = spread * rng.standard_normal((400, 10, 20)), spread * rng.standard_normal((400, 20))
+    values = truth + rng.standard_normal(truth.shape)
+    series = CycleSeries(np.arange(400.0), values, np.ones(20))
+    recorder = InnovationRecorder(series, of_data=False)
+    for cycle, forecast in enumerate(forecasts):
+        recorder.put(cycle, forecast)
+    recorder.moments()
+    (panel,) = ranks(recorder.ranks).rows[0].panels
+    band, bars = (next(m for m in panel.marks if m.kind == kind) for kind in ("span", "line"))
+    outside = (bars.y[1:-1:2] < band.y[0]) | (bars.y[1:-1:2] > band.top[0])
+    assert outside.sum() <= 2
+    again = InnovationRecorder(series, of_data=False)
+    again.put(3, forecasts[3])
+    again.moments()
+    assert np.array_equal(again.ranks[3], recorder.ranks[3])  # whatever cycles share its block
 
 
 def test_correlated_errors(tmp_path):

@@ -22,6 +22,7 @@ from en4dvar.schemes import MINIMISERS
 
 MANY = 48  # members that start far enough apart
 ENOUGH = 30  # iterations beyond which more of them seldom help
+SHARP = 2000  # readings whose χ² tells apart errors of the same two digits
 SHARE = 0.1  # of the members beyond a limit of the model, from when on the window is too long
 CAUSES = ("rank-deficient", "ensemble-collapse", "not-converged", "at-bound")  # of residuals that are odd
 FEW = 0.1  # of the members lost: so many others may lie where a cut of the prior is advised
@@ -122,10 +123,10 @@ class Case:
         return "" if self.exact else "; where the times err, a larger data.error.time_std"
 
     def reading(self, value: float) -> str:
-        """A size of readings in the unit in which their errors are stated."""
-        observable = self.a.problem.observable
+        """A size of readings in the unit in which their errors are stated, as sharp as so many of them tell it."""
+        observable, digits = self.a.problem.observable, 2 if len(self.a.observations) < SHARP else 4
         unit = self.a.observations.error_unit or observable.display_unit
-        return f"{convert(value, observable.unit, unit):.2g} {unit}"
+        return f"{convert(value, observable.unit, unit):.{digits}g} {unit}"
 
 
 def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
@@ -250,7 +251,7 @@ def _odd(case: Case) -> str:
 
 def _validity(case: Case) -> str:
     a, used = case.a, case.a.observations.used
-    left = np.quantile(a.beyond.min(axis=1), SHARE, method="lower")
+    left = np.quantile(a.beyond[active_members(a.posterior_failures)].min(axis=1), SHARE, method="lower")
     kept = used[a.observations.times[used] < left]
     if len(kept) <= len(a.parameters):
         return f"choose a model that is valid there: too few readings ({len(kept)}) come before for a shorter window"

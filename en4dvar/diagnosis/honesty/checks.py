@@ -95,7 +95,7 @@ def structure(analysis: Analysis) -> Findings:
             "the model is right): the error bars assume independent errors"
         )
         # what is missed moves an estimate by no more than |e| of its standard deviations
-        small = float(residuals.white @ residuals.white) < 1
+        small = float(np.sum((1.0 if residuals.weights is None else residuals.weights) * residuals.white**2)) < 1
         yield caution("residual-structure", words, "caution" if small else None)
     if residuals.collapse_chance < ODD:
         words = (
@@ -123,12 +123,13 @@ def missed(analysis: Analysis) -> Findings:
     names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
     if amplitude is None or amplitude.name not in names:
         return
-    low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
+    members = analysis.posterior[:, names.index(amplitude.name)]
+    low, told = np.nanquantile(members, NINE_OF_TEN[0]), diag.member_quantiles(members, NINE_OF_TEN)
     error, part = float(np.median(analysis.own_std)), analysis.problem.parts[0].where
     if not low > THERE * error:
         return
     signal = float(np.std(analysis.observations.values[part][analysis.observations.weights[part] > 0]))
-    by = f"by {shown(low, amplitude)} to {shown(high, amplitude)} (standard deviation of the discrepancy, 5 to 95 %)"
+    by = f"by {' to '.join(shown(end, amplitude) for end in told)} (standard deviation of the discrepancy, 5 to 95 %)"
     if low > NOTHING * signal:
         words = (
             f"the model explains little: it misses the readings {by}, while these vary by {shown(signal, amplitude)}"

@@ -119,8 +119,9 @@ class Shift:
 
     ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
     negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
-    minus J of the fit, positive where the data speak against the alternative. Where linear response does not tell,
-    these are NaN and ``reason`` says why. ``runs``: forward runs it took.
+    minus J of the fit, positive where data or prior speak against the alternative; ``misfit_change``: of its part of
+    the readings. Where linear response does not tell, these are NaN and ``reason`` says why. ``runs``: forward runs it
+    took.
     """
 
     name: str
@@ -131,6 +132,7 @@ class Shift:
     cost_change: float
     runs: int
     reason: str = ""
+    misfit_change: float = math.nan
 
     @property
     def settled(self) -> bool:
@@ -152,11 +154,12 @@ def is_manifold(relative: float) -> bool:
     return relative <= -1 or abs(math.log1p(relative)) >= TWOFOLD
 
 
-def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str:
+def exclusion(chi2_per_reading: float, readings: int, misfit_change: float) -> str:
     """Words for an alternative with which the readings cannot be fitted, whose shifts mean nothing; "" for others. χ²
-    with it is that of the fit and twice the change of J. Errors count as large as the fit itself finds them.
+    with it is that of the fit and twice the change of the readings' part of J. Errors count as large as the fit itself
+    finds them.
     """
-    chi2 = chi2_per_reading * readings + 2 * cost_change
+    chi2 = chi2_per_reading * readings + 2 * misfit_change
     limit = max(1.0, chi2_per_reading) * (readings + EXCLUDED * math.sqrt(2 * readings))
     excluded = f"the readings exclude it: χ² is {chi2:.0f} for {counted(readings, 'reading')}"
     return excluded if readings and chi2 > limit else ""
@@ -243,6 +246,10 @@ def _shift(
     def untold(reason: str, runs: int = 0) -> Shift:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
 
+    def background(moved: Array, of_prior: Array) -> float:
+        z = problem.prior.white_change(response.at + moved - problem.prior.mean - of_prior)
+        return 0.5 * float(z @ z)
+
     try:
         changed = changed_problem(problem, alternative)
         of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
@@ -265,12 +272,12 @@ def _shift(
             return untold(NOWHERE, runs)
         moved, there, runs = fit.centre - response.at, fit.cost, runs + fit.runs
     else:
-        z = prior.white_change(response.at + chord.known - prior.mean - of_prior)
-        there = 0.5 * float(z @ z) + chord.of_readings
+        there = background(chord.known, of_prior) + chord.of_readings
+    misfit_change = there - background(moved, of_prior) - cost + background(np.zeros(len(std)), np.zeros(len(std)))
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode
     relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))
-    return Shift(*about, change, relative, moved / std, there - cost, runs)
+    return Shift(*about, change, relative, moved / std, there - cost, runs, misfit_change=misfit_change)
 
 
 @dataclass(frozen=True)
