@@ -21,7 +21,7 @@ import yaml
 from en4dvar.assembly.build import build_one, estimated_files
 from en4dvar.config import Config, load_config, resolve
 from en4dvar.config.document import document_from, override
-from en4dvar.diagnosis.diagnostics import active_members, member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import Executor
@@ -170,8 +170,7 @@ def _compared(
     """
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
-    alive = active_members(analysis.posterior_failures)
-    members = prior.from_physical(analysis.posterior[alive])
+    members, count = prior.from_physical(analysis.survivors), len(analysis.posterior)
     known = np.array([truth.get(p.name, np.nan) for p in prior.parameters])
     x = np.vstack([members, [_coordinate(term, value) for term, value in zip(prior.terms, known, strict=True)]])
     run = Composite(problem)(x)
@@ -188,12 +187,12 @@ def _compared(
     with np.errstate(invalid="ignore", divide="ignore"):
         z = (true - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isnan(true), np.nan, np.sum(draws < true, axis=0))
-    if len(draws) < len(alive):
+    if len(draws) < count:
         place = member_stream(seed, "places of ranks").uniform(size=len(rank))
-        rank = np.floor((rank + place) * (len(alive) + 1) / (len(draws) + 1))
+        rank = np.floor((rank + place) * (count + 1) / (len(draws) + 1))
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
     numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
-    return Judged(number, name, numbers, len(alive), serious)
+    return Judged(number, name, numbers, count, serious)
 
 
 def _coordinate(term: PriorTerm, value: float) -> float:
