@@ -74,3 +74,12 @@ class Fragile(Oscillator):
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         raise ArithmeticError("no step succeeds")
+
+
+class Brittle(Oscillator):
+    """Cannot be integrated where it is stiffer than 3.5 N/m."""
+
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        if theta["k"] > 3.5:
+            raise ArithmeticError("too stiff")
+        return super().initial_state(theta)

@@ -225,6 +225,11 @@ class Analysis:
         return f"<Analysis {self.name}: {', '.join(told)}; {ended}, warnings: {len(self.cautions)}>"
 
     @property
+    def survivors(self) -> Array:
+        """(N', n) the posterior members that are alive."""
+        return self.posterior[[not reason for reason in self.posterior_failures]]
+
+    @property
     def observations(self) -> Observations:
         """The observations that were assimilated."""
         return self.problem.observations

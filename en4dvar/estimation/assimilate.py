@@ -120,7 +120,8 @@ def _through(stages: Stages) -> Analysis:
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
         widened = with_shifts(ends.members, analysis.what_if, stages.seed)
-        analysis = replace(analysis, posterior=prior.to_physical(widened))
+        alive = ends.run.active[:, None]
+        analysis = replace(analysis, posterior=np.where(alive, prior.to_physical(widened), np.nan))
     return analysis
 
 
@@ -188,7 +189,7 @@ def _concluded(
         what_if=shifts,
         withheld=withheld,
         ledger=path,
-        fields=conclusions.fields_of(problem, space.members, ends.members, ends.mode),
+        fields=conclusions.fields_of(problem, space.members, ends.members, ends.mode, ends.run.active),
     )
 
 
@@ -286,7 +287,7 @@ def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
     if not (stages.compares and stages.settings.what_if and isinstance(model, PiecewiseModel) and model.walks):
         return ()
     by = INTERVALS * float(np.median(np.diff(np.unique(problem.observations.times[problem.observations.used]))))
-    here, said = prior.from_physical(analysis.posterior), []
+    here, said = prior.from_physical(analysis.survivors), []
     for shift in (-by, by):
         moved = [replace(varied, knots=tuple(t + shift for t in varied.knots)) for varied in model.varying]
         if min(varied.knots[0] for varied in moved) <= 0:
@@ -295,7 +296,7 @@ def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
         if there is None:
             continue
         gain = there.log_evidence - analysis.log_evidence
-        way = np.abs(prior.from_physical(there.posterior).mean(axis=0) - here.mean(axis=0)) / here.std(axis=0, ddof=1)
+        way = np.abs(prior.from_physical(there.survivors).mean(axis=0) - here.mean(axis=0)) / here.std(axis=0, ddof=1)
         if gain > math.log(diag.DECISIVE) or (gain > math.log(HINT) and np.max(way) > FAR):
             where = f"{clock(model, by)} {'earlier' if shift < 0 else 'later'} (log evidence {gain:+.1f})"
             name = prior.parameters[int(np.argmax(way))].name

@@ -46,7 +46,7 @@ def outcome_of(
         settings=settings,
         seed=seed,
         prior=prior.to_physical(before),
-        posterior=prior.to_physical(after),
+        posterior=np.where(run.active[:, None], prior.to_physical(after), np.nan),
         centre=prior.to_physical(centre),
         prior_predictions=_whole_rows(prior_run.predictions),
         posterior_predictions=_whole_rows(run.predictions),
@@ -62,8 +62,12 @@ def outcome_of(
     )
 
 
-def fields_of(problem: InverseProblem, before: Array, after: Array, centre: Array) -> tuple[FieldEstimate, ...]:
-    """Fields that were told by modes, cell by cell, of members (N, n) before and after and of the ``centre`` (n,)."""
+def fields_of(
+    problem: InverseProblem, before: Array, after: Array, centre: Array, active: Array
+) -> tuple[FieldEstimate, ...]:
+    """Fields that were told by modes, cell by cell, of members (N, n) before and after, of which ``active`` (N,) live,
+    and of the ``centre`` (n,).
+    """
     initial, layout = InitialStates(problem), problem.model.layout
 
     def states(x: Array) -> Array:
@@ -77,6 +81,7 @@ def fields_of(problem: InverseProblem, before: Array, after: Array, centre: Arra
     estimates = []
     for name, prior in priors.items():
         a, b, (c,) = (x[:, layout[name]] for x in each)
+        b = np.where(active[:, None], b, np.nan)
         moments = [moment for x in (b, a) for moment in (np.nanmean(x, axis=0), np.nanstd(x, axis=0, ddof=1))]
         estimates.append(FieldEstimate(prior, b, c, *moments))
     return tuple(estimates)

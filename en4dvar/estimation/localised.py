@@ -27,7 +27,7 @@ from en4dvar.ensemble.missing import filled, fitted
 from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.estimation import conclusions
 from en4dvar.executor import Executor
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.errors import En4dvarError, TooFewMembersError
 from en4dvar.plumbing.hints import counted
 from en4dvar.priors.field_prior import FieldPrior
@@ -82,7 +82,7 @@ class Localised:
         self._end(run, central, centre, variance)
         after = ensemble[:, :n].copy()
         fields = [
-            self._field(prior_field, columns, base, centre, *moment)
+            self._field(prior_field, columns, base, centre, np.flatnonzero(run.active), *moment)
             for (prior_field, columns), moment in zip(self.fields, moments, strict=True)
         ]
         analysis = conclusions.outcome_of(
@@ -201,24 +201,29 @@ class Localised:
             raise En4dvarError(f"the model has no initial state at the prior mean: {reason}")
         return np.asarray(states[0])
 
-    def _moments(self, prior_field: FieldPrior, columns: slice, base: Array) -> tuple[Array, Array]:
-        """Mean and std (size,) of the field's values, member by member."""
-        start = base[self.problem.model.layout[prior_field.field.name]]
+    def _moments(
+        self, prior_field: FieldPrior, columns: slice, base: Array, some: Indices | None = None
+    ) -> tuple[Array, Array]:
+        """Mean and std (size,) of the field's values over ``some`` members or all, member by member."""
+        start, some = base[self.problem.model.layout[prior_field.field.name]], self.everyone if some is None else some
         mean, squares = np.zeros((2, prior_field.field.size))
-        for count, member in enumerate(self.ensemble, 1):
-            change = prior_field.applied(start, member[columns]) - mean
+        for count, i in enumerate(some, 1):
+            change = prior_field.applied(start, self.ensemble[i, columns]) - mean
             mean += change / count
             squares += change**2 * ((count - 1) / count)
-        return mean, np.sqrt(squares / (len(self.ensemble) - 1))
+        return mean, np.sqrt(squares / (len(some) - 1))
 
     def _field(
-        self, prior_field: FieldPrior, columns: slice, base: Array, centre: Array, prior_mean: Array, prior_std: Array
-    ) -> FieldEstimate:
-        """What became of it; the ensemble then holds the values themselves."""
+        self, prior_field: FieldPrior, columns: slice, base: Array, centre: Array, alive: Indices, prior_mean: Array,
+        prior_std: Array,
+    ) -> FieldEstimate:  # fmt: skip
+        """What became of it; the ensemble then holds the values themselves, of members ``alive``: a lost one stands
+        where it was lost.
+        """
         start = base[self.problem.model.layout[prior_field.field.name]]
-        mean, std = self._moments(prior_field, columns, base)
-        for member in self.ensemble:
-            member[columns] = prior_field.applied(start, member[columns])
+        mean, std = self._moments(prior_field, columns, base, alive)
+        for i, member in enumerate(self.ensemble):
+            member[columns] = prior_field.applied(start, member[columns]) if i in alive else np.nan
         at_centre = prior_field.applied(start, centre[columns])
         return FieldEstimate(prior_field, self.ensemble[:, columns], at_centre, mean, std, prior_mean, prior_std)
 

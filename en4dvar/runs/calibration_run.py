@@ -164,10 +164,13 @@ def _compared(
 ) -> Judged:
     """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings; NaN of J_o where
     the truth lacks a parameter or lies beyond the prior.
+
+    Members that were lost are no part of the posterior that is quoted. All sets have the ranks of as many, so that a
+    rank among survivors is drawn from the places among all of them that it stands for.
     """
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
-    members = prior.from_physical(analysis.posterior)
+    members, count = prior.from_physical(analysis.survivors), len(analysis.posterior)
     known = np.array([truth.get(p.name, np.nan) for p in prior.parameters])
     x = np.vstack([members, [_coordinate(term, value) for term, value in zip(prior.terms, known, strict=True)]])
     run = Composite(problem)(x)
@@ -184,9 +187,12 @@ def _compared(
     with np.errstate(invalid="ignore", divide="ignore"):
         z = (true - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isnan(true), np.nan, np.sum(draws < true, axis=0))
+    if len(draws) < count:
+        place = member_stream(seed, "places of ranks").uniform(size=len(rank))
+        rank = np.floor((rank + place) * (count + 1) / (len(draws) + 1))
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
     numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
-    return Judged(number, name, numbers, len(members), serious)
+    return Judged(number, name, numbers, count, serious)
 
 
 def _coordinate(term: PriorTerm, value: float) -> float:

@@ -182,13 +182,22 @@ class SweepResult:
 
     @property
     def mean(self) -> Array:
-        """(n,) NRMSE-weighted mean over the sets, Σ w θ / Σ w with w the NRMSE of the best fit."""
-        return np.asarray(np.average(self.theta, axis=0, weights=self.nrmse))
+        """(n,) NRMSE-weighted mean over the sets."""
+        return by_fit(self.theta, self.nrmse)[0]
 
     @property
     def std(self) -> Array:
-        """(n,) NRMSE-weighted standard deviation over the sets, √(Σ w (θ − mean)² / Σ w)."""
-        return np.asarray(np.sqrt(np.average((self.theta - self.mean) ** 2, axis=0, weights=self.nrmse)))
+        """(n,) NRMSE-weighted standard deviation over the sets."""
+        return by_fit(self.theta, self.nrmse)[1]
+
+
+def by_fit(values: Array, fits: Array) -> tuple[Array, Array]:
+    """Mean Σ w θ / Σ w and standard deviation √(Σ w (θ − mean)² / Σ w) of values θ (S, …) of data sets, w their NRMSE
+    (S,), or 0 of a set that is fitted worse than by a constant; where all are they count alike.
+    """
+    weights = np.where(fits < 0, 0.0, fits) if np.any(fits > 0) else np.ones(len(fits))
+    mean = np.average(values, axis=0, weights=weights)
+    return np.asarray(mean), np.asarray(np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weights)))
 
 
 def run_sweep(

@@ -17,7 +17,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_text
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.sweep import SweepResult
+from en4dvar.sampling.sweep import SweepResult, by_fit
 from en4dvar_agarose.paper import Model, Route
 from en4dvar_agarose.settings import StudyPlan
 
@@ -82,15 +82,15 @@ class Fit:
         """(S,) NRMSE of the best fit, or of the centre of the posterior."""
         if route == "sweep":
             return self.sweep.nrmse
-        return np.array([nrmse(a.observations.values, a.centre_predictions) for a in self.analyses])
+        each = ((a.observations, a.centre_predictions) for a in self.analyses)
+        return np.array([nrmse(o.values[o.used], predicted[o.used]) for o, predicted in each])
 
     def summary(self, route: Route, name: str) -> tuple[float, float]:
         """NRMSE-weighted mean and standard deviation over the sets, SI; a fixed value has none."""
         if not self.estimated(name):
             return self.problems[0].fixed[name], 0.0
-        weights, values = self.nrmse(route), self.values(route, name)
-        mean = float(np.average(values, weights=weights))
-        return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weights)))
+        mean, std = by_fit(self.values(route, name), self.nrmse(route))
+        return float(mean), float(std)
 
     def dfs(self) -> dict[str, float]:
         """Degrees of freedom for signal of each estimated parameter, mean over the sets."""

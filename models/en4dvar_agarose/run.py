@@ -254,10 +254,7 @@ class _Parts:
     def _one_gel(self, fit: Fit) -> OneGel:
         """All bubbles of a gel with the same material parameters."""
         names = [name for name in SHARED if fit.estimated(name)]
-        singles = [
-            Single.of_physical(fit.prior, a.posterior[np.isfinite(a.posterior).all(axis=1)], a.centre)
-            for a in fit.analyses
-        ]
+        singles = [Single.of_physical(fit.prior, a.survivors, a.centre) for a in fit.analyses]
         settings = self.plan.configs[fit.gel][fit.model].assimilation
         joint = estimate_jointly(sharing(fit.problems, names), settings, self.plan.seed, self.executor, singles)
         readings = np.array([len(p.observations) for p in fit.problems])

@@ -52,6 +52,16 @@ def test_linear_posterior_does_not_notice_failed_members(linearisation, how, rea
     assert any(f"{lost.sum()} of 20 members failed in the prior forecast: {reason}" in w for w in holed.warnings)
 
 
+def test_members_that_fail_are_no_part_of_the_posterior():
+    whole = assimilate(make_problem(Linear(NAMES), TRUTH), settings("bundle"), 3)
+    limit = float(np.quantile(whole.posterior[:, 0], 0.8))
+    found = assimilate(make_problem(Fragile(limit, names=NAMES), TRUTH), settings("bundle"), 3)
+    lost = whole.posterior[:, 0] > limit
+    assert [bool(reason) for reason in found.posterior_failures] == lost.tolist()
+    assert np.isnan(found.posterior[lost]).all()
+    np.testing.assert_allclose(found.survivors, whole.posterior[~lost], rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])
 def test_too_few_survivors_is_an_error_with_reasons(linearisation):
     problem = make_problem(Fragile(-1.5, names=NAMES), TRUTH)

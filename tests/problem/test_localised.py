@@ -215,6 +215,10 @@ def test_members_that_fail_are_left_where_they_failed_and_told():
     assert any(c.code == "members-lost" for c in found.cautions)
     alive = np.array([not reason for reason in found.posterior_failures])
     assert np.abs(found.posterior_predictions[alive].mean(axis=0) - VALUES).max() < 1
+    (field,) = found.fields  # of survivors alone
+    assert np.isnan(field.members[lost]).all()
+    assert field.mean == pytest.approx(field.members[alive].mean(axis=0), rel=1e-12)
+    assert field.std == pytest.approx(field.members[alive].std(axis=0, ddof=1), rel=1e-9)
     with pytest.raises(TooFewMembersError, match=r"failed in the prior forecast; at least 12 must survive.*too hot"):
         assimilate(line(Fragile()), settings("es-mda", min_active_fraction=1.0), SEED)
 

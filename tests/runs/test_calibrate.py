@@ -29,7 +29,7 @@ def toy(tmp_path):
 
 
 def sixty(toy, out, **options):
-    return en4dvar.calibrate(toy, options.pop("sets", 60), overrides=QUIET, out=out, **options)
+    return en4dvar.calibrate(toy, options.pop("sets", 60), out=out, **{"overrides": QUIET, **options})
 
 
 def test_a_right_configuration_passes(toy, tmp_path):
@@ -129,6 +129,19 @@ def test_readings_of_a_law_that_lacks_a_parameter_leave_its_ranks_out(toy, tmp_p
     assert len(result.good) == 3
     assert [verdict.quantity for verdict in result.verdicts] == ["A", "k"]
     assert "no ranks of c, fit, errors: what made the readings has no such value" in result.remarks
+
+
+def test_lost_members_are_no_part_of_the_posterior_that_is_judged(toy, tmp_path):
+    lost = {"model.name": "toy_models:Brittle", "data.error.position_std": "2 mm", "assimilation.refine": "none"}
+    result = sixty(toy, tmp_path / "out", sets=3, overrides={**QUIET, **lost})
+    names = [name for name, _ in result.quantities]
+    assert any("members-lost" in judged.cautions for judged in result.good)
+    assert result.column("q95", names.index("k")).max() <= 3.5
+    assert np.isfinite(result.column("z", names.index(FIT))).all()
+    assert {judged.members for judged in result.good} == {24}
+    ranks = result.ranks(names.index(FIT))
+    assert len(ranks) == len(result.good)
+    assert set(ranks) <= set(range(25))
 
 
 def test_a_truth_at_the_limit_of_a_prior_has_the_lowest_rank(toy, tmp_path):

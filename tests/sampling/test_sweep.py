@@ -22,7 +22,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import NOISE_SCALE
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.priors.prior import PriorTerm
-from en4dvar.sampling.sweep import SweepSettings, best_over_shifts, run_sweep, sobol_box, targets
+from en4dvar.sampling.sweep import SweepResult, SweepSettings, best_over_shifts, run_sweep, sobol_box, targets
 from en4dvar_agarose.run import one_model
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -227,3 +227,14 @@ def test_a_step_far_below_the_times_of_the_readings_is_refused_before_memory_is_
     slow = replace(problems[0], observations=readings(np.arange(61.0), np.arange(61.0) ** 2))
     with pytest.raises(DataError, match=r"2\.4e\+09 instants.* readings are 1 apart, give a larger --step"):
         run_sweep([slow], SweepSettings(64, 0.8e-6, 0.025e-6), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("fits", "mean", "std"),
+    [([0.9, 0.3], 2.5, np.sqrt(0.75)), ([0.9, -0.4], 2.0, 0.0), ([0.9, -0.9], 2.0, 0.0), ([-0.4, -0.2], 3.0, 1.0)],
+)
+def test_a_set_that_is_fitted_worse_than_by_a_constant_does_not_count(fits, mean, std):
+    theta = np.array([[2.0], [4.0]])
+    result = SweepResult(("a", "b"), (), theta, np.zeros(2), np.array(fits), 1)
+    assert result.mean == pytest.approx([mean])
+    assert result.std == pytest.approx([std])

@@ -227,8 +227,7 @@ class _Estimate:
             self.tell(f"{problem.observations.name} alone")
             analysis = assimilate(problem, settings, own_seed(self.seed, problem.observations.name), self.executor)
             self.other_runs += analysis.forward_runs
-            alive = np.isfinite(analysis.posterior).all(axis=1)
-            singles.append(Single.of_physical(problem.prior, analysis.posterior[alive], analysis.centre))
+            singles.append(Single.of_physical(problem.prior, analysis.survivors, analysis.centre))
         return singles
 
     def _starts(self, singles: Sequence[Single]) -> list[Place]:
