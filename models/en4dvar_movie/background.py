@@ -151,6 +151,12 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
     unit = 1.0 if of_integers else max(float(np.nanmax(np.abs(f))) for f in samples) / 255  # a grey level
     noise = pixel_noise(first, unit)
+    low, high = np.transpose([(f.min(), f.max()) for f in (ndimage.uniform_filter(s, 5) for s in samples)])
+    if low.min() < -max(SURE * noise, np.median(high)):
+        raise DataError(
+            f"{movie.path}: frames are negative where they are darkest, as where a background was subtracted; take "
+            "those that the camera saved, or add to all the least number by which none is (ImageJ: Process > Math)"
+        )
     blind = _writing(leading, noise) | _outside(samples) | unseen
     if watched is not None:
         blind |= ~watched
@@ -172,8 +178,7 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         words = f"{movie.path}: what {what} about {at} (x,y) in all frames is no bubble and is not looked at"
         movie.notes.extend([words] * (at != "" and words not in movie.notes))
     if empty > 2:
-        steady = pixel_noise(np.array([f - level for f in leading[:empty]]), unit)
-        noise = steady * float(np.sqrt(empty / (empty - 1)))
+        noise = pixel_noise(np.array([f - level for f in leading[:empty]]), unit) * (empty / (empty - 1)) ** 0.5
     background = _with_sign(level, samples, noise, empty, blind, unit)
     if empty:
         background = _refined(background, samples)
@@ -349,8 +354,7 @@ def _quiet(leading: Sequence[Frame], first: Frame, noise: float, blind: Mask) ->
             frames = (_lit_as(f.astype(np.float32), first) for f in leading[: number + 1])
             shade = np.array([float(np.mean((f - first)[middle])) for f in frames])
             begun = shade * np.sign(shade[-1]) > max(BEGUN * abs(shade[-1]), SURE * noise)
-            mostly = [n for n in range(1, number) if begun[n] and np.mean(begun[n:number]) > 0.5]
-            return min(mostly, default=number)
+            return min((n for n in range(1, number) if begun[n] and np.mean(begun[n:number]) > 0.5), default=number)
     return len(leading)
 
 

@@ -12,6 +12,7 @@ from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 ROUNDS = 30
 CLOSE = (1e-2, 1e-2, 1e-3)  # pixels: the step at which each turn ends
 RIM_SHARE = 0.45  # of the radius: where the bright centre ends, before it is fitted
+SOFT_SHARE = 0.1  # of the radius: over which width it ends beside the blur, before that is fitted
 LEVEL_SPREAD = 0.001  # of the background next to the bubble, in contrasts: halos are not the level of the background
 FIRST_SPREAD = (0.03, 0.0, 0.0)  # of the contrast in the first turns
 LOOSE = 0.1  # how much less is known of the level next to an edge that is blurred
@@ -29,7 +30,7 @@ APART = 1.5  # widths of the edge: nested circles that are closer are not told a
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
 TWO = 2.6  # their own widths by which two edges lie apart that are no blurred one
 SURE = 0.03  # share of the squares that two edges must explain and a blurred one does not
-X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
+X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM, SOFT = range(SHAPE)
 Parts = tuple[int, int]  # where the distances of nested circles begin, and the rim
 Fit = tuple[Array, Parts, float, Optics]  # parameters (P,), the noise, and the optics as they are known for this frame
 
@@ -78,14 +79,14 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int, least: int =
     radii = nested_radii(image, start, optics, circles)
     p = np.concatenate([np.zeros(SHAPE), radii[0] - radii[1:], optics.rim])
     p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
-    p[RIM] = RIM_SHARE * radii[-1]
+    p[[RIM, SOFT]] = RIM_SHARE * radii[-1], SOFT_SHARE * radii[-1]
     noise = abs(optics.contrast)
     parts = SHAPE, SHAPE + circles - 1
     for turn in range(3):  # the ring of pixels follows the circle; the cutoff follows the noise
         gaps, rim = p[slice(*parts)], p[parts[1] :]
         ring = _ring(p, gaps, rim)
         if _glare_is_far(p, gaps, ring):
-            p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
+            p[[GLARE, RIM, SOFT]] = 0.0, RIM_SHARE * _innermost(p, gaps), SOFT_SHARE * _innermost(p, gaps)
         first = SHAPE + 2 * (max(modes_for(image, p), least) - 1)
         parts = first, first + circles - 1
         p = np.concatenate([p[:SHAPE], np.zeros(first - SHAPE), gaps, rim])
@@ -154,9 +155,9 @@ def _known(p: Array, parts: Parts, ring: Array, noise: float, optics: Optics) ->
     centre, precision = np.zeros(len(p)), np.zeros(len(p))
     gaps = p[slice(*parts)]
     inner = _innermost(p, gaps)
-    centre[RIM], centre[CONTRAST] = RIM_SHARE * inner, optics.contrast
+    centre[[RIM, SOFT, CONTRAST]] = RIM_SHARE * inner, SOFT_SHARE * inner, optics.contrast
     tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
-    precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
+    precision[[RIM, SOFT]] = noise**2 * tight / (0.1 * inner) ** 2
     precision[SHAPE : parts[0]] = noise**2 / (LONG * p[R]) ** 2
     precision[GLARE] = noise**2 * tight / optics.contrast**2
     chance = 2 * (8 / np.pi**0.5 * p[W] / p[R]) ** 0.5 * p[W] * noise / abs(p[CONTRAST])  # 2 std of the width's square
@@ -196,6 +197,7 @@ def _descend(
         trial[CONTRAST] = max(trial[CONTRAST], darkest)
         inner = _innermost(trial, trial[slice(*parts)])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
+        trial[SOFT] = np.clip(trial[SOFT], 1e-3 * inner, 0.5 * inner)
         gone = not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape)
         if gone and (not nested or damping > 1e6):  # a single circle that shrinks to nothing is a speck of dirt
             return None
@@ -240,7 +242,7 @@ def _outlines(image: Array, p: Array, parts: Parts, noise: float, optics: Optics
         return None
     shape = p[SHAPE : parts[0]].reshape(-1, 2).T
     mode_variance = float(np.diag(inverse)[SHAPE : parts[0]].mean()) if shape.size else 0.0
-    free = len(p) - 2 * _glare_is_far(p, gaps, ring)
+    free = len(p) - 3 * _glare_is_far(p, gaps, ring)
     # how much larger even and odd rows show the radius: Σ r dm/dR / Σ (dm/dR)²
     slopes, product = (np.bincount(places[:, 0] % 2, rows[:, R] * part, 2) for part in (rows[:, R], off))
     slopes = np.maximum(slopes, 1e-30)

@@ -45,12 +45,13 @@ class Chain:
 
     @property
     def score(self) -> float:
-        """How far its wall travels, beyond what errors make of it, and a little of its size."""
+        """How far its wall travels from frame to frame, beyond what errors make of it, and a little of its size."""
         radii = self.circles[:, 2]
         widths = np.array([c.outlines[0].width for c in self.candidates])
         widths[widths < 0.5 * radii] = 0
         travel = np.maximum(np.abs(np.diff(radii)) - np.maximum(0.3, BLURRED * np.hypot(widths[1:], widths[:-1])), 0)
-        return float(np.sum(np.minimum(travel, 0.5 * np.maximum(radii[1:], radii[:-1]))) + 0.02 * radii.sum())
+        frames = np.diff([c.frame for c in self.candidates])
+        return float(np.sum(np.minimum(travel, 0.5 * np.maximum(radii[1:], radii[:-1])) / frames) + 0.02 * radii.sum())
 
     def distance(self, x: float, y: float) -> tuple[float, float]:
         """From a point to the nearest that its outline comes; and to its centre."""

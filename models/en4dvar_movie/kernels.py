@@ -2,15 +2,15 @@
 
 The image near the outline is modelled as
 
-    m(r, θ) = b + c/S Σ_s P(r − ρ(θ) + d_s) + g Φ((ρ_g − r)/w),      ρ(θ) = R + Σ_{n≥2} A_n cos nθ + B_n sin nθ,
-    P(u) = Φ(−u/w) − a/v φ((u − e)/v),      v² = w² + s²,
+    m(r, θ) = b + c/S Σ_s P(r − ρ(θ) + d_s) + g Φ((ρ_g − r)/w_g),      ρ(θ) = R + Σ_{n≥2} A_n cos nθ + B_n sin nθ,
+    P(u) = Φ(−u/w) − a/v φ((u − e)/v),      v² = w² + s²,      w_g² = w² + s_g²,
 
 in polar coordinates about the centre (x, y): an edge of width w (std of the blur), contrast c, with a bright rim that
 holds the light of a width a of the bubble, at a distance e outside the edge, of width s before the blur, and the bright
-centre of a bubble that acts as a lens, g and ρ_g. Where S flashes light one exposure, S nested circles share the
-contrast; the outermost has the radius R, the others lie d_s inside it. The order of the parameters is that of
-:data:`NAMES`, then A_2, B_2, A_3, …; d_2, d_3, … from ``parts[0]`` on; and from ``parts[1]`` on a, e and s, or nothing
-where there is no rim. Pixels that are not looked at are NaN.
+centre of a bubble that acts as a lens, g and ρ_g, which ends over a width s_g before the blur. Where S flashes light
+one exposure, S nested circles share the contrast; the outermost has the radius R, the others lie d_s inside it. The
+order of the parameters is that of :data:`NAMES`, then A_2, B_2, A_3, …; d_2, d_3, … from ``parts[0]`` on; and from
+``parts[1]`` on a, e and s, or nothing where there is no rim. Pixels that are not looked at are NaN.
 """
 
 import math
@@ -19,7 +19,7 @@ import numpy as np
 
 from en4dvar.plumbing.compiled import kernel
 
-NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g")
+NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g", "s_g")
 SHAPE = len(NAMES)  # the first mode's place
 FAR = 7.0  # widths from an edge where nothing of it is left in double precision but 1e-12
 _ROOT_HALF = math.sqrt(0.5)
@@ -79,17 +79,19 @@ def _row(j, i, p, parts, row):
         edge += f
         if circle:
             row[gaps + circle - 1] = -f
-    zg = (p[7] - r) / w
+    wg = math.hypot(w, p[8])
+    zg = (p[7] - r) / wg
     G, g = _normal(zg)
-    glare = p[6] * g / w
+    glare = p[6] * g / wg
     # r falls by cos as x grows, θ grows by sin/r: both move the edge
     row[0] = edge * (cos + slope * sin / r) + glare * cos
     row[1] = edge * (sin - slope * cos / r) + glare * sin
     row[2] = edge
-    row[3] -= glare * zg
+    row[3] -= glare * zg * w / wg
     row[4] = 1.0
     row[6] = G
     row[7] = glare
+    row[8] = -glare * zg * p[8] / wg
     for k in range(SHAPE, gaps):
         row[k] *= edge
     return p[4] + p[5] * row[5] + p[6] * G

@@ -135,6 +135,14 @@ def test_a_wall_that_travels_slowly_scores_more_than_a_larger_one_that_rests():
     assert Chain(tuple(slow)).score > Chain(tuple(rests)).score
 
 
+def test_patches_of_a_few_frames_far_between_are_no_wall_that_travels():
+    """As those of bands of light that roll through the frames: no radius of theirs continues another."""
+    wall = [24.3, 32.2, 36.8, 39.2, 40.1, 39.2, 36.8, 32.1, 24.2, 8.6, 7.3, *[6.6] * 12]
+    bubble = [circle(k, 50.0, R) for k, R in enumerate(wall)]
+    bands = [circle(k, 50.0, R, 70.0) for k, R in ((15, 23.8), (21, 16.6), (23, 32.5), (26, 15.4), (31, 35.0))]
+    assert Chain(tuple(bubble)).score > 1.5 * Chain(tuple(bands)).score
+
+
 def test_a_bubble_that_touches_is_told():
     own = Chain(tuple(circle(k, 50.0, 20.0) for k in range(20)))
     other = Chain(tuple(circle(k, 110.0 - 4 * k, 8.0) for k in range(20)))
