@@ -152,6 +152,8 @@ class _Linear:
         # Least squares in u − rest: readings, then the prior, the right-hand side last
         white = np.zeros((len(draws), len(self.at.values), len(rows)))
         white[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
+        if not observations.noise.quadratic:
+            white[possible, :, len(of_u)] *= observations.noise.pulls(observations.values, predicted[possible])
         readings, moved = np.split(white, [len(of_u) + 1], axis=2)
         readings[:, :, -1] -= np.einsum("dkh,dh->dk", moved, apart)
         prior = np.tile(np.column_stack([np.eye(len(rest)), -rest]), (len(draws), 1, 1))

@@ -113,6 +113,16 @@ def half_known() -> InverseProblem:
     return make_problem(model, (1.0, 0.5), prior=(PriorTerm.normal(a, 0.8, 1.0), PriorTerm.normal(b, 0.5, 0.001)))
 
 
+def near_zero(read: float, std: float = 0.1, log_std: float = 2.0) -> InverseProblem:
+    """A positive slope, its prior about 1, that was read with an error."""
+    model = Vectorised(("a",))
+    a = Parameter("a", "m", bounds=(0.0, np.inf))
+    problem = make_problem(model, (1.0,), k=1, prior=(PriorTerm.lognormal(a, 1.0, log_std),))
+    t = problem.observations.times[0]
+    data = replace(problem.observations, values=np.array([read * model.curve(np.ones(1), t)]))
+    return replace_std(replace(problem, observations=data), std * model.curve(np.ones(1), t))
+
+
 def spiked() -> InverseProblem:
     problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40)
     values = problem.observations.values.copy()
@@ -175,6 +185,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     ),
     "down-weighted": lambda: run(outlier()),
     "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
+    "upper-limit": lambda: run(near_zero(0.0), refine="mcmc"),
     "not-informed": lambda: run(half_known()),
 }
 

@@ -16,6 +16,7 @@ from diagnosis.provoked import (
     bent,
     chain_not_converged,
     linear,
+    near_zero,
     ramp,
     replace_std,
     run,
@@ -175,6 +176,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "readings-missing": linear,  # a model that gives them
     "residual-structure": lambda: make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05),  # a model with the wave
     "at-bound": in_bounds,
+    "upper-limit": lambda: near_zero(1.0),  # a larger value, or better readings
     "several-modes": positive,
     "discrepancy-found": lambda: with_discrepancy(  # a model that has the wave
         make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05), amplitude=(0.025, 1.5), length=(0.2, 0.7)

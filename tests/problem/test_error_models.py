@@ -242,7 +242,7 @@ def outlier(problem, k=3, by=3.0):
 def test_an_outlier_leaves_the_robust_posterior_where_it_was():
     plain = make_problem(Vectorised(NAMES), TRUTH, k=61)
     spoilt = outlier(plain)
-    settings = AssimilationSettings(members=20)
+    settings = AssimilationSettings(members=20, cost_tolerance=1e-7)  # of a J that the outlier makes large
     clean = assimilate(plain, settings, 1)
     std = clean.posterior.std(axis=0, ddof=1)
     gaussian = assimilate(with_errors(plain, values=spoilt), settings, 1)
@@ -282,7 +282,7 @@ def test_robust_posterior_against_quadrature():
     mean = float(density @ a)
     std = float(np.sqrt(density @ (a - mean) ** 2))
     assert abs(analysis.posterior.mean() - mean) < 0.1 * std
-    assert 0.88 < analysis.posterior.std(ddof=1) / std < 1.02
+    assert 0.95 < analysis.posterior.std(ddof=1) / std < 1.05
 
 
 def test_what_cannot_be_combined_is_refused():

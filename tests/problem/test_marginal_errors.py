@@ -47,5 +47,7 @@ def test_rows_are_whitened_as_a_linearisation_at_each_run_is(kind):
     values = stream.standard_normal(K)
     white = noise.whitened_rows(values, rows, predicted)
     for b in range(runs):
-        _, slopes = noise.whiten(values, np.ones(K), Linearisation(predicted[b], rows))
+        residual, slopes = noise.whiten(values, np.ones(K), Linearisation(predicted[b], rows))
         np.testing.assert_allclose(white[b].T, slopes, rtol=1e-12, atol=1e-12)
+        off = noise.whitened_rows(values, (values - predicted.values[b])[None], predicted)[b, 0]
+        np.testing.assert_allclose(off * noise.pulls(values, predicted)[b], residual[:K], rtol=1e-12, atol=1e-12)

@@ -182,6 +182,10 @@ class Noise:
         """ρ'(v)/v (…, K) of whitened residuals, at most 1: how much of a Gaussian observation one counts."""
         return np.ones_like(residual)
 
+    def _curvature(self, light: Array) -> Array:
+        """What stands for ρ''(v) (…, K) in SᵀS, from ρ'(v)/v."""
+        return light
+
     @property
     def counts_within(self) -> float:
         """Standard deviations within which an observation counts in full."""
@@ -235,8 +239,11 @@ class Noise:
         s = self.error_std(at.prediction)
         z = (values - at.prediction.values) / s
         v = self._decorrelated(z)
-        row = root_weight * np.sqrt(self.influence(v))
-        d, sensitivity = row * v, self._whitened_anomalies(row, s, at.anomalies)
+        light = self.influence(v)
+        curvature = self._curvature(light)
+        row = root_weight * np.sqrt(curvature)
+        slope = v if curvature is light else v * light / curvature  # Sᵀd is the gradient in any case
+        d, sensitivity = row * slope, self._whitened_anomalies(row, s, at.anomalies)
         log_s = self._log_std_anomalies(at)
         if log_s is None:
             return d, sensitivity
@@ -250,8 +257,14 @@ class Noise:
 
     def whitened_rows(self, values: Array, rows: Array, predicted: Predicted) -> Array:
         """√w L⁻¹ D⁻¹ c (B, M, K) of rows c (M, K), with R and how much readings count, w, of runs (B,)."""
-        s, light = self.error_std(predicted), self._light(values, predicted)
-        return np.asarray(self._decorrelated(rows / s[..., None, :]) * np.sqrt(light)[:, None])
+        s, curvature = self.error_std(predicted), self._curvature(self._light(values, predicted))
+        return np.asarray(self._decorrelated(rows / s[..., None, :]) * np.sqrt(curvature)[:, None])
+
+    def pulls(self, values: Array, predicted: Predicted) -> Array:
+        """How much more the residual of each reading counts than its row does (…, K), so that their product is ρ'."""
+        light = self._light(values, predicted)
+        curvature = self._curvature(light)
+        return np.ones_like(light) if curvature is light else np.asarray(light / curvature)
 
     def attributes(self) -> dict[str, float]:
         """Numbers that say of which kind the errors are, for the record."""

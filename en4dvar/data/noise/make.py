@@ -146,6 +146,9 @@ class BlockNoise(Noise):
             )
         return product
 
+    def pulls(self, values: Array, predicted: Predicted) -> Array:
+        return self._each(predicted, lambda n, y, p: n.pulls(y, p), values)
+
     def whitened_rows(self, values: Array, rows: Array, predicted: Predicted) -> Array:
         white = np.empty((len(predicted.values), *rows.shape))
         for b in self.blocks:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from statistics import median
+from statistics import NormalDist, median
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -44,6 +44,9 @@ FAR = 1.5  # prior standard deviations from the prior mean that are worth naming
 MOST_NAMED, MOST_LISTED = 3, 6
 CLOCK = "on the clock of the data"  # which shows another time than the model's, if data.time_zero says so
 NONE: Mapping[str, str] = MappingProxyType({})
+ONE_SIDED = 1.645  # standard deviations below which 5 % of a Gaussian lie
+REACHES = 5.0  # times below its median where a prior still has 5 %: its lower end stands for a value of zero
+AS_WELL = 1 / 3  # ratio of evidences from which on data are explained as well: what is less speaks for one of the two
 Findings = Iterator[Caution]
 
 
@@ -287,6 +290,31 @@ def information(
         count = sum(of == field for of in modes.values())
         words = f"{len(names)} of {count} modes of the initial {field} are hardly informed by the data"
         yield replace(caution("not-informed", words, parameters=tuple(names)), advice=UNREAD)
+
+
+def limits(prior: Prior, sample: Array, silent: Collection[str]) -> Findings:
+    """Positive parameters, but for ``silent`` names, that readings do not tell from zero: as far as their priors reach
+    down, the lowest values explain the readings as well as others. ``sample`` (N, n), transformed, of the posterior.
+
+    With u the share of the prior below a value, the density of u in the posterior at u = 0 is the evidence of the model
+    without the parameter over that with it (Dickey 1971, Ann. Math. Stat. 42, 204). It is counted below half of the
+    median of u. It is that at zero only where it is as high as next to the median: a small value may be known well.
+    """
+    for j, (name, term) in enumerate(zip(prior.names, prior.terms, strict=True)):
+        low, middle = term.to_physical(term.mean + term.std * np.array([-ONE_SIDED, 0.0]))
+        if name in silent or min(term.parameter.bounds[0], low) < 0 or REACHES * low > middle:
+            continue
+        u = np.array([NormalDist(term.mean, term.std).cdf(x) for x in sample[:, j]])
+        half = float(np.median(u)) / 2
+        below = float(np.mean(u < half))
+        if min(below / half, 4 * below) > AS_WELL:
+            most = shown(float(np.quantile(term.to_physical(sample[:, j]), 0.95)), term.parameter)
+            words = (
+                f"the readings do not tell {name} from zero: values near it explain them as well (evidence ratio "
+                f"{below / half:.2g}), so that the lower end of the interval is that of the prior; with this prior "
+                f"{name} is below {most} with a probability of 95 %"
+            )
+            yield caution("upper-limit", words, parameters=(name,))
 
 
 def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approximate: str = "") -> Findings:

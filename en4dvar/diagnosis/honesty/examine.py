@@ -78,8 +78,11 @@ def examine(
         silent |= {*prior.names} - {*path}
     silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
     modes = {p.parameter.name: p.of.field.name for p in a.problem.perturbations if p.of is not None}
-    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes)
-    return advised(a, worst_first((*warnings, *little)))
+    little = tuple(checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes))
+    silent |= {*a.problem.of_errors, *(name for finding in little for name in finding.parameters)}
+    sample = prior.from_physical(a.draws) if len(a.draws) else control.posterior[alive]
+    zeros = checks.limits(prior, sample, silent) if whole else ()
+    return advised(a, worst_first((*warnings, *little, *zeros)))
 
 
 def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[Caution]:
