@@ -26,6 +26,7 @@ MOST_BRIEF = 4  # parameters in one line
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
 ROUNDING = 1e-12  # of the std: what is left of the mean of members that are centred at 0
 LITTLE, AS_WIDE = "data say little", "not narrowed by the data"
+FROM_ABOVE = "limited only from above"
 MODAL = "of several modes: quantiles, no mean ± std"
 DFS_WORDS = (
     (HARDLY_INFORMED, AS_WIDE),
@@ -91,6 +92,8 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
         return ""
     if any(c.code == "not-informed" and name in c.parameters for c in cautions):
         return LITTLE
+    if any(c.code == "upper-limit" and name in c.parameters for c in cautions):
+        return FROM_ABOVE
     return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
 
 

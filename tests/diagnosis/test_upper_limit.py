@@ -1,4 +1,4 @@
-"""A positive parameter that readings do not tell from zero is said to have an upper limit only."""
+"""A positive parameter that readings limit only from above is said to have an upper limit."""
 
 from __future__ import annotations
 

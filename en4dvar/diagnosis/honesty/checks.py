@@ -292,13 +292,15 @@ def information(
         yield replace(caution("not-informed", words, parameters=tuple(names)), advice=UNREAD)
 
 
-def limits(prior: Prior, sample: Array, silent: Collection[str]) -> Findings:
-    """Positive parameters, but for ``silent`` names, that readings do not tell from zero: as far as their priors reach
-    down, the lowest values explain the readings as well as others. ``sample`` (N, n), transformed, of the posterior.
+def limits(prior: Prior, sample: Array, members: Array, silent: Collection[str]) -> Findings:
+    """Positive parameters, but for ``silent`` names, that readings limit only from above: as far as their priors reach
+    down, the lowest values explain the readings as well as others. ``sample`` (N, n), transformed, and ``members``
+    (M, n), physical, are of the posterior; limits are those of the tables, by the members.
 
     With u the share of the prior below a value, the density of u in the posterior at u = 0 is the evidence of the model
-    without the parameter over that with it (Dickey 1971, Ann. Math. Stat. 42, 204). It is counted below half of the
-    median of u. It is that at zero only where it is as high as next to the median: a small value may be known well.
+    with the lowest value over that of any (Dickey 1971, Ann. Math. Stat. 42, 204). Other parameters may make up for it:
+    of G and α the readings may know the product alone. It is counted below half of the median of u, and stands for that
+    at zero only where it is as high as next to the median: a small value may be known well.
     """
     for j, (name, term) in enumerate(zip(prior.names, prior.terms, strict=True)):
         low, middle = term.to_physical(term.mean + term.std * np.array([-ONE_SIDED, 0.0]))
@@ -308,11 +310,11 @@ def limits(prior: Prior, sample: Array, silent: Collection[str]) -> Findings:
         half = float(np.median(u)) / 2
         below = float(np.mean(u < half))
         if min(below / half, 4 * below) > AS_WELL:
-            most = shown(float(np.quantile(term.to_physical(sample[:, j]), 0.95)), term.parameter)
+            most = shown(float(diag.member_quantiles(members[:, j], (0.95,))[0]), term.parameter)
             words = (
-                f"the readings do not tell {name} from zero: values near it explain them as well (evidence ratio "
-                f"{below / half:.2g}), so that the lower end of the interval is that of the prior; with this prior "
-                f"{name} is below {most} with a probability of 95 %"
+                f"the readings limit {name} only from above: the lowest values that its prior allows, with whatever "
+                f"values of other parameters go with them, explain them as well (evidence ratio {below / half:.2g}); "
+                f"with this prior {name} is below {most} with a probability of 95 %"
             )
             yield caution("upper-limit", words, parameters=(name,))
 

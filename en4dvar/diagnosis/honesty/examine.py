@@ -81,7 +81,7 @@ def examine(
     little = tuple(checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes))
     silent |= {*a.problem.of_errors, *(name for finding in little for name in finding.parameters)}
     sample = prior.from_physical(a.draws) if len(a.draws) else control.posterior[alive]
-    zeros = checks.limits(prior, sample, silent) if whole else ()
+    zeros = checks.limits(prior, sample, members, silent) if whole else ()
     return advised(a, worst_first((*warnings, *little, *zeros)))
 
 
