@@ -358,9 +358,11 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
 
 
 def ranked(scores: Sequence[S]) -> list[S]:
-    """The scores with the difference of their log-evidence from the best one, and their probabilities."""
+    """The scores with the difference of their log-evidence from the best one, and their probabilities, which nobody
+    knows (NaN) where one evidence is not known.
+    """
     evidence = np.array([s.log_evidence for s in scores])
     difference = evidence - evidence[np.isfinite(evidence)].max(initial=-np.inf)
     odds = np.exp(difference)  # the models are equally probable before the data
-    judged = zip(scores, difference.tolist(), (odds / np.nansum(odds)).tolist(), strict=True)
+    judged = zip(scores, difference.tolist(), (odds / np.sum(odds)).tolist(), strict=True)
     return [replace(s, difference=d, probability=p) for s, d, p in judged]

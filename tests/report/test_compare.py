@@ -18,10 +18,13 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.report.compare import (
     ALL,
+    Comparison,
+    ModelScore,
     compare_runs,
     comparison_table,
     overlay,
     preferred,
+    ranked,
     with_evidences,
     write_comparison,
 )
@@ -96,6 +99,14 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     assert "do not record a configuration" in done.stderr
     assert "* as the result has it" in done.stdout
     assert comparison_table(compare_runs(runs)) in done.output
+
+
+def test_no_probability_is_told_beside_an_evidence_that_is_not_known():
+    """The one of two models whose evidence is known had the probability 1."""
+    scores = [ModelScore(run, "gel", e, np.nan, np.nan, 1.0, 2.0, 0.9) for run, e in (("a", np.nan), ("b", 2.0))]
+    comparison = Comparison(tuple(ranked(scores)))
+    assert np.isnan([score.probability for score in comparison.scores]).all()
+    assert comparison.verdict("gel") == "not compared: the evidence of a is not known before its warnings are settled"
 
 
 @pytest.mark.slow
