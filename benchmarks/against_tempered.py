@@ -101,7 +101,7 @@ def minima_of(case: Case) -> Sequence[Minimum]:
 def estimate(case: Case) -> Record:
     """What the product says (n,)."""
     analysis = assimilate(*case)
-    x = case.problem.prior.from_physical(analysis.posterior)
+    x = case.problem.prior.from_physical(analysis.survivors)
     return {
         "mean": x.mean(axis=0),
         "std": x.std(axis=0, ddof=1),

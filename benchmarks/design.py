@@ -181,7 +181,7 @@ def promise(problem: InverseProblem, seed: int) -> Record:
     except En4dvarError as error:
         return {"failure": str(error)}
     which = [prior.names.index(name) for name in ABOUT]
-    z = (prior.from_physical(analysis.posterior) - prior.mean)[:, which] / prior.std[which]
+    z = (prior.from_physical(analysis.survivors) - prior.mean)[:, which] / prior.std[which]
     covariance, mean = np.cov(z, rowvar=False), z.mean(axis=0)
     log_det = float(np.linalg.slogdet(covariance)[1])
     return {

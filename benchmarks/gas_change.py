@@ -44,7 +44,7 @@ def bubble(path: Path) -> Callable[[str], Record]:
             return {"reason": "no readings after the window"}
         assert isinstance(problem.model, BubbleModel)
         within = problem.observations.values
-        members = problem.prior.from_physical(assimilate(problem, AssimilationSettings(what_if=False), 1).posterior)
+        members = problem.prior.from_physical(assimilate(problem, AssimilationSettings(what_if=False), 1).survivors)
         found: Record = {"commit": commit()}
         for value in VALUES:
             changed = replace(problem, model=replace(problem.model, gas_change=value))

@@ -78,7 +78,7 @@ def chain_of(key: str) -> Record:
     """Mean and standard deviation (n,) of a long chain, transformed."""
     problem, seed = of_key(key)
     analysis = assimilate(problem, SETTINGS, seed)
-    x = problem.prior.from_physical(analysis.posterior)
+    x = problem.prior.from_physical(analysis.survivors)
     emulated = guide(WeightSpace(problem, SETTINGS, seed, SerialExecutor()), x, seed)
     chain = mcmc.sample(
         lambda z: log_posterior(problem, z), x, 10_000 + seed, target=TARGET, max_steps=600, emulated=emulated
@@ -116,7 +116,7 @@ def judged(key: str, chain: Record, settings: AssimilationSettings = SETTINGS) -
 
 def distance(problem: InverseProblem, analysis: Analysis, chain: Record) -> Record:
     """Of an ensemble from what the chain says: the farthest mean, the farthest ratio of standard deviations."""
-    x = problem.prior.from_physical(analysis.posterior)
+    x = problem.prior.from_physical(analysis.survivors)
     mean, std = np.array(chain["mean"]), np.array(chain["std"])
     ratio = x.std(axis=0, ddof=1) / std
     return {

@@ -72,7 +72,7 @@ def reference(problem: InverseProblem, seed: int) -> Record:
     """Lowest J of twenty starts of a random ensemble, and of a Markov chain from where they end."""
     settings = counted(starts=20, members=120, sampling="random")
     end = assimilate(problem, settings, 10_000 + seed)
-    x = problem.prior.from_physical(end.posterior)
+    x = problem.prior.from_physical(end.survivors)
     chain = mcmc.sample(lambda z: log_posterior(problem, z), x[:48], seed, max_steps=CHAIN_STEPS)
     # J of the prior itself, not of its ensemble
     centre = float(log_posterior(problem, problem.prior.from_physical(end.centre)[None])[0])

@@ -90,7 +90,7 @@ def experiment(key: str) -> Record:
             analysis = assimilate(problem, AssimilationSettings(what_if=False), int(key))
         except En4dvarError as error:  # counted: no run may fail
             return {"failure": str(error)}
-    x = prior.from_physical(analysis.posterior)
+    x = prior.from_physical(analysis.survivors)
     return {
         "truth": truth,
         "mean": x.mean(axis=0),

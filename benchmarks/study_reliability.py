@@ -140,7 +140,7 @@ def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: in
         log = {}
         for name, base in bases.items():
             problem = replace(base, observations=observed)
-            members = assimilate(problem, AssimilationSettings(what_if=False), number, executor).posterior
+            members = assimilate(problem, AssimilationSettings(what_if=False), number, executor).survivors
             start = base.prior.white(base.prior.from_physical(members))
             log[name] = own_draws(problem, start, number, executor).log_evidence
     return law, log["qlkv"] - log["nh"]

@@ -200,7 +200,7 @@ def twins(run_dir: Path, count: int, seed: int) -> None:
             at = runs.predicted[next(i for i, reason in enumerate(runs.failures) if not reason)]
             values = problem.observations.noise.drawn(at, rng)
             twin = replace(problem, observations=replace(problem.observations, values=values, continued=None))
-            members = assimilate(twin, replace(config.assimilation, what_if=False), seed).posterior
+            members = assimilate(twin, replace(config.assimilation, what_if=False), seed).survivors
             made.append(twin)
             begun.append(twin.prior.white(twin.prior.from_physical(members[np.isfinite(members).all(axis=1)])))
         of_twins, _ = sampled_sets(made, begun, config.seed, None, lambda words: print(words, flush=True))

@@ -74,7 +74,7 @@ def fitted(walk: RandomWalk, y: np.ndarray, error: float, what_if: bool, seed: i
     )
     problem = InverseProblem(MODEL, MODEL.observables[0], observations, PRIOR).varied([walk])
     a = assimilate(problem, replace(SETTINGS, what_if=what_if), seed)
-    return a, np.log(a.pieces(walk, a.posterior))
+    return a, np.log(a.pieces(walk, a.survivors))
 
 
 def experiment(key: str) -> Record:

@@ -83,7 +83,7 @@ def _beside(
     problem: InverseProblem, fit: Analysis, again: Analysis, in_std: np.ndarray, gained: float, words: str
 ) -> str:
     transform, names = problem.prior.from_physical, problem.prior.names
-    std = transform(fit.posterior).std(axis=0, ddof=1)
+    std = transform(fit.survivors).std(axis=0, ddof=1)
     shift = (transform(again.centre) - transform(fit.centre)) / std
     at = [names.index(number) for number in NUMBERS if number in names]
     off = np.abs(in_std - shift)[at]

@@ -99,7 +99,7 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings) -> Record:
         analysis = assimilate(twin.problem, settings, seed)
     except En4dvarError as error:  # counted: no run may fail
         return {"failure": str(error)}
-    x = of.from_physical(analysis.posterior)[:, : len(twin.truth)]  # amplitude and length of a discrepancy are last
+    x = of.from_physical(analysis.survivors)[:, : len(twin.truth)]  # amplitude and length of a discrepancy are last
     return {
         "truth": twin.truth,
         "mean": x.mean(axis=0),

@@ -114,7 +114,8 @@ class Result(StoredResult):
         """What ArviZ works with: the groups as its ``InferenceData``; from version 1 on that is a DataTree.
 
         ``units``: those of parameters and readings. ``chains``: the members that are alive, which have no order, are
-        dealt out to so many, for plots and diagnostics that compare chains; what is left over is left out.
+        dealt out to so many, for plots and diagnostics that compare chains; what is left over is left out, as members
+        are that failed.
 
         Raises :class:`ConfigError` where ArviZ is not installed, or members are too few for the chains.
         """
@@ -125,7 +126,7 @@ class Result(StoredResult):
         groups = {path.strip("/"): node.to_dataset() for path, node in self.tree.children.items()}
         if units == "display":
             groups = {name: _in_display_units(group) for name, group in groups.items()}
-        if chains != 1:
+        if chains != 1 or 0 < self.alive.sum() < len(self.alive):
             groups = {name: self._dealt(group, chains) for name, group in groups.items()}
         known = getattr(arviz, "InferenceData", None)
         if known is None or isinstance(self.tree, known):
@@ -141,7 +142,7 @@ class Result(StoredResult):
         if not {"chain", "draw"} <= {*group.dims}:
             return group
         each = int(self.alive.sum()) // max(chains, 1)
-        if each < FEWEST_DRAWS:
+        if each < FEWEST_DRAWS and chains != 1:
             raise ConfigError(f"{self.alive.sum()} members are too few for {chains} chains of {FEWEST_DRAWS} draws")
         living = np.flatnonzero(self.alive)[: each * chains].reshape(chains, each)
         chosen = group.isel(chain=0, draw=xr.DataArray(living, dims=("own", "among")))

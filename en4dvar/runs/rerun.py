@@ -151,6 +151,8 @@ def _same_bits(a: np.ndarray, b: np.ndarray) -> bool:
 def _by_how_much(a: np.ndarray, b: np.ndarray) -> str:
     if a.shape != b.shape or a.dtype.kind != "f":
         return ""
+    if np.any(np.isnan(a) != np.isnan(b)):
+        return ": other values are missing (NaN)"
     scale = float(np.nanmax(np.abs(a), initial=0.0)) or 1.0
     return f" by up to {float(np.nanmax(np.abs(a - b), initial=0.0)) / scale:.2g} of its largest value"
 

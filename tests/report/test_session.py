@@ -86,6 +86,14 @@ def test_from_version_1_on_arviz_takes_a_tree(result: Result, monkeypatch: pytes
         xr.testing.assert_identical(tree[name].to_dataset(), before[name])
 
 
+def test_arviz_gets_members_that_are_alive(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "arviz", types.ModuleType("arviz"))
+    shown = result.to_inference_data()["posterior"]["G"]
+    assert 1 < result.alive.sum() < len(result.alive)
+    assert shown.dims == ("chain", "draw")
+    np.testing.assert_array_equal(shown.values[0], result.posterior["G"].values[0, result.alive])
+
+
 def test_a_twin_experiment_and_a_sweep(tmp_path: Path) -> None:
     own = {**TWIN, "output": {"directory": str(tmp_path / "twin"), "report": False}}
     twin = en4dvar.run_twin(own)

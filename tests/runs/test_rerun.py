@@ -1,5 +1,6 @@
 """A run repeated from its result files alone: the same bits, or what has changed."""
 
+import numpy as np
 import pytest
 from run_files import add_to_pack, configuration, make_campaign, run_cli
 from toy_config import write_toy
@@ -7,7 +8,7 @@ from toy_config import write_toy
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.result import load_result
 from en4dvar.results.pack import PACK
-from en4dvar.runs.rerun import rerun
+from en4dvar.runs.rerun import differences, rerun
 from en4dvar.runs.runner import run, run_campaign
 
 
@@ -27,6 +28,18 @@ def test_a_campaign_is_repeated(campaign):
     assert all(one.variables > 40 for one in found.sets)
     assert list(found.failures) == ["empty"]
     assert str(found).splitlines()[-1] == "not repeated, for they have no result: empty"
+
+
+@pytest.mark.parametrize(
+    ("again", "words"),
+    [
+        ([1.0, np.nan, 4.0], ()),
+        ([1.0, np.nan, 3.0], ("/x differs by up to 0.25 of its largest value",)),
+        ([np.nan, 2.0, 4.0], ("/x differs: other values are missing (NaN)",)),
+    ],
+)
+def test_what_differs_is_said(again, words):
+    assert differences({"/x": np.array([1.0, np.nan, 4.0])}, {"/x": np.array(again)}) == words
 
 
 @pytest.mark.slow

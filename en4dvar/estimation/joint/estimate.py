@@ -9,6 +9,8 @@ import numpy as np
 from en4dvar.data.observations import require_distinct
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
+from en4dvar.diagnosis.diagnostics import active_members
+from en4dvar.diagnosis.honesty import checks
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
@@ -30,7 +32,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.plumbing.hints import counted, rounded
-from en4dvar.priors.prior import own_seed
+from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -158,14 +160,20 @@ class _Estimate:
         said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
         without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         members, cautions = self._members(lowest, drawn=self.samples and not without)
-        grids = tuple(plotting_times(problem) for problem in joint.experiments)
-        forecasts = tuple(
-            experiment.run(_points(joint, members, lowest.at.place, experiment.e), grids[experiment.e])
-            for experiment in experiments
-        )
+        grids, stage = tuple(map(plotting_times, joint.experiments)), "forecast of the joint posterior"
+        forecasts = self._forecasts(members, lowest.at.place, grids)
+        needed = math.ceil(self.settings.min_active_fraction * len(members.border))
         for problem, run in zip(joint.experiments, forecasts, strict=True):
-            needed = math.ceil(self.settings.min_active_fraction * (len(run) - 1))
-            require_members(problem, run[:-1], needed, "forecast of the joint posterior")
+            require_members(problem, run[:-1], needed, stage)
+        lost = [
+            next(filter(None, reasons), "") for reasons in zip(*(run.failures[:-1] for run in forecasts), strict=True)
+        ]
+        if any(lost):
+            if (alive := active_members(lost)).sum() >= needed:  # else no interval is trusted
+                members = members.of(alive)
+                forecasts = self._forecasts(members, lowest.at.place, grids)
+            advice = "the posterior holds only where all models run: find out why they fail, or give narrower priors"
+            cautions += [replace(c, advice=advice) for c in checks.loss(stage, lost, Prior(()))]
         cautions += missing_readings(max(forecast.filled for forecast in forecasts))
         if not lowest.converged:
             advice = "make the runs again with a larger assimilation.max_iterations (that of the first counts)"
@@ -202,6 +210,10 @@ class _Estimate:
             agreement=agreed,
             without=without,
         )
+
+    def _forecasts(self, members: JointMembers, mode: Place, grids: Sequence[Array]) -> tuple[Forecast, ...]:
+        each = zip(self.experiments, grids, strict=True)
+        return tuple(e.run(_points(self.joint, members, mode, e.e), grid) for e, grid in each)
 
     def _without(
         self, cost: float, singles: Sequence[Single], said: Sequence[Statement], alone: Array, most: int

@@ -16,14 +16,14 @@ by their phase and not by their height. The others then keep what is shared abou
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.priors.prior import member_stream
 
 DRAWS, INNER = 96, 36  # of what is shared, and of the own quantities for each of them
@@ -50,6 +50,10 @@ class JointMembers:
     own: tuple[Array, ...]
     effective: float
     log_evidence: float
+
+    def of(self, alive: Mask) -> "JointMembers":
+        """Those that are alive, of N."""
+        return replace(self, border=self.border[alive], own=tuple(of_it[alive] for of_it in self.own))
 
 
 def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
