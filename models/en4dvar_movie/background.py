@@ -14,11 +14,10 @@ from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie, saturated
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
-from en4dvar_movie.surfaces import is_round, smooth_surface, surface_beside_discs
+from en4dvar_movie.surfaces import FLICKER, flashes_first, is_round, smooth_surface, surface_beside_discs
 
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
-FLICKER = 0.2  # of the brightness: what a lamp may change, whatever else the frame shows
 CORNERS = 0.01  # share of the tiles that are brighter yet, where a larger change is a bubble's or a flash's
 TOP, MANY = 90, 0.4  # per cent of the tiles that are not the brightest; the share of tiles that tells the light
 ALIKE, CLOSE = 4.0, 0.05  # std of noise, or of the brightness, by which tiles in one light may differ
@@ -28,8 +27,7 @@ OFTEN = 0.1  # of the frames: in how many it does
 RESTLESS, LEAST_PAIRS = 0.25, 5  # share and number of steps from frame to frame in which writing changes
 MOST, BLANK = (5, 95), 0.25  # per cent of the pixels; share of the most contrast of writing that it has in any frame
 WRITING = (24, 14, 3)  # pixels: largest height of writing; how far about its changing part the rest of it lies
-LEADING = 40  # frames looked at for the background
-SAMPLES = 24  # frames looked at for what they share
+LEADING, SAMPLES = 40, 24  # frames looked at for the background, and for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
 MIDDLE = 0.2  # of the light in its middle: what a dark bubble lacks about it at least
@@ -51,8 +49,7 @@ BEGUN, SURE = 0.25, 2.0  # of the shade in a bubble's middle, and of a pixel's n
 HALO, STILL = 9, 0.01  # side of squares whose mean tells more than a pixel, and what it may differ by
 SURELY = 1.4  # variances of noise beyond which the scatter in such a square is something else
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
-STEADY = 10_000  # tiles that say how bright a frame is
-CHANGED = 0.3  # share of tiles that a flash changes
+STEADY, CHANGED = 10_000, 0.3  # tiles that say how bright a frame is, and the share of them that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
 SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
 MOVES = 0.05  # of the light: std on an edge that moves
@@ -149,6 +146,8 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         # at the border is what only some frames show
         unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
     of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
+    leading = leading[(flashed := flashes_first(leading, samples)) :]
+    first = leading[0].astype(np.float32)
     unit = 1.0 if of_integers else max(float(np.nanmax(np.abs(f))) for f in samples) / 255  # a grey level
     noise = pixel_noise(first, unit)
     low, high = np.transpose([(f.min(), f.max()) for f in (ndimage.uniform_filter(s, 5) for s in samples)])
@@ -179,7 +178,7 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         movie.notes.extend([words] * (at != "" and words not in movie.notes))
     if empty > 2:
         noise = pixel_noise(np.array([f - level for f in leading[:empty]]), unit) * (empty / (empty - 1)) ** 0.5
-    background = _with_sign(level, samples, noise, empty, blind, unit)
+    background = _with_sign(level, samples, noise, empty and flashed + empty, blind, unit)
     if empty:
         background = _refined(background, samples)
     return replace(background, drift=drift), _optics(background, samples, movie, circles)

@@ -60,10 +60,10 @@ def look_at(
     spot = _spot(tiles, background.noise / TILE)
     if start is not None:
         places = [start]
-    elif number < background.frames:
-        return Look(number, (), "no bubble: the frame is one of the background's", spot)
     elif share_changed(tiles, background.noise) > CHANGED:
         return Look(number, (), "flash: much of the frame is brighter than the background", spot)
+    elif number < background.frames:
+        return Look(number, (), "no bubble: the frame is one of the background's", spot)
     else:
         places = [place for place, _ in locate(tiles, background.noise / TILE)]
     if not places:

@@ -11,6 +11,8 @@ from en4dvar_movie.outline import LEAST_CONTRAST, MOST_PATCHES, circle_through, 
 
 ROUNDS, LEANINGS = 8, 30  # of a fit that leaves out what is far off, and of one that lies above most
 OFTEN = 90  # per cent of the frames that are darker than what begins an envelope
+FLICKER = 0.2  # of the brightness: what a lamp may change, whatever else the frame shows
+NEARLY = 0.9  # of a frame: what a flash lights that is no background
 WITHIN = 0.01  # weight of what lies within an envelope, as a share of that of what lies beyond it
 TOPS = 98  # per cent of the pixels that lie lower over an envelope than those that tell its scatter
 MEAN, DIFFERS = 3, 0.3  # pixels: side of squares that differ from a level; by which share of what differs most
@@ -26,6 +28,14 @@ BLURRED, SHADE = 12, 0.03  # pixels that its blur reaches at most; the share of 
 SLENDER = 0.25  # of the field: what stands still before the background takes less
 COVERED, BARE = 0.6, 0.5  # of a ring about its middle: what a bubble always covers of it at least; and of one beyond
 ROUND, DISC = 0.5, 0.8  # of a patch and the disc through its rim that both share, if it is all that tells a bubble
+
+
+def flashes_first(leading: Sequence[Frame], samples: Sequence[Frame]) -> int:
+    """How many frames at the beginning of a movie a flash lights: nearly everywhere, they are brighter than most frames
+    by more than a lamp flickers."""
+    usual = np.percentile(np.array(samples, dtype=np.float32), OFTEN, axis=0)
+    lit = [np.mean(frame > (1 + FLICKER) * np.abs(usual)) > NEARLY for frame in leading]
+    return [*lit, False].index(False) % len(leading)
 
 
 def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> tuple[Array, Mask] | None:

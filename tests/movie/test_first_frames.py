@@ -158,3 +158,16 @@ def test_a_bright_bubble_whose_edge_moves_by_half_a_pixel_is_no_aperture(radius,
         result = track(movie, 1)
         assert wrong(result.readings, radii) == []
         assert all(r.used for r in result.readings)
+
+
+@pytest.mark.parametrize(("flash", "empty"), [(1.5, 3), (5.0, 1)])
+def test_a_movie_may_begin_with_a_flash(flash, empty):
+    """Which is no background: beside it nothing was read, or radii were half a pixel off."""
+    radii = np.linspace(20, 7, 8)
+    lamp = 1 - 0.3 * np.linspace(-1, 1, 72)[:, None] ** 2 - 0.2 * np.linspace(-1, 1, 80) ** 2
+    shown = [
+        frame * lamp * (flash if n == 0 else 1) for n, frame in enumerate(filmed((72, 80), radii=radii, empty=empty))
+    ]
+    readings = track(movie_of([np.minimum(frame, 255).astype(np.uint8) for frame in shown])).readings
+    assert [r.frame for r in readings if not r.used] == list(range(empty))
+    np.testing.assert_allclose([r.radius for r in readings[empty:]], radii, atol=0.15)
