@@ -1,4 +1,4 @@
-"""A bubble that a stiff gel hardly lets collapse swings about its radius at rest, which is proposed from its minimum."""
+"""A bubble that a stiff gel hardly lets collapse swings about its radius at rest, proposed from its minimum."""
 
 from __future__ import annotations
 
