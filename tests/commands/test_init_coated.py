@@ -33,7 +33,7 @@ def test_a_coated_bubble_in_water(law: str) -> None:
     _films(1)
     done = call("init", "--data", "sh/s0.csv", *UNITS, "--law", law, *ASKED)
     assert done.exit_code == 0, done.output
-    assert "no bubble has such a radius" not in done.stderr
+    assert "are the units of both columns right?" not in done.stderr
     assert "make G wrong" not in done.stderr
     assert "will give this" not in done.stderr
     (problem,) = build(load_config("s0.yaml"))

@@ -30,7 +30,8 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     )
     Path("s.csv").write_text(_in_other_units(Path("b.csv")))
     done = call("init", "--data", "s.csv", *UNITS)
-    told = "R_max 0.195 um, read every 0.0007 us: no bubble has such a radius; are the units of both columns right? "
+    told = "R_max 0.195 um, read every 0.0007 us: only ultrasound of small amplitude leaves a bubble such a radius; "
+    told += "are the units of both columns right? "
     assert f"{told}Units 1000 times larger would make it a usual one" in done.stderr
 
 

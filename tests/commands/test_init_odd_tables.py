@@ -178,6 +178,15 @@ def test_diameters_in_german(tmp_path: Path) -> None:
     assert "'Durchmesser_um' seems to hold diameters" in output
 
 
+def test_diameters_behind_another_word(tmp_path: Path) -> None:
+    text = rows("t_us,bubble diameter (um)\n", 2 * radii())
+    code, output = told(tmp_path, text)
+    assert code == 0, output
+    assert "'bubble diameter (um)' seems to hold diameters; if so, give half their unit" in output
+    _, output = told(tmp_path, text, "--radius-unit", "0.5*um", "--force")
+    assert "bubble diameter (um)' s" not in output  # neither "seems to" nor "says"
+
+
 def test_a_radius_at_rest_beside_diameters_is_not_halved(tmp_path: Path) -> None:
     path = write(tmp_path / "film.csv", "# Req = 22\nt_us,D_um", scale=2.0)
     done = call("init", "--data", path, "--out", tmp_path / "film.yaml", "--radius-unit", "0.5*um")

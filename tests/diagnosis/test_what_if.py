@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import minimize
 from toys import Decay, Linear, Wave, make_problem, with_discrepancy, with_noise
 
+from en4dvar.data.noise import Predicted
 from en4dvar.diagnosis.response.budget import ASSUMED, budget
-from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, changed_problem
+from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, _factors, changed_problem, prior_shift
 from en4dvar.ensemble.forecast import Composite, cost
 from en4dvar.estimation.assimilate import _fitted, assimilate
 from en4dvar.estimation.stages import Stages
@@ -148,6 +149,34 @@ def test_what_is_beyond_linear_response_is_fitted_again(alternative):
     std = problem.prior.from_physical(analysis.posterior).std(axis=0, ddof=1)
     np.testing.assert_allclose(start + shift.in_std * std, done.x, rtol=0, atol=0.05 * std.max())
     assert np.abs(shift.in_std).max() > 3
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_readings_on_another_scale_and_clock_have_the_same_errors_and_discrepancy_there(held):
+    """J of predictions on these scales is what it was: the covariance is that of the file's readings."""
+    problem = with_discrepancy(make_problem(Wave(), [1.0, 3.0], k=12, time_std=0.02), grows_beyond=2.0)
+    names = [p.name for p in problem.discrepancy]
+    if held:
+        terms = tuple(term for term in problem.prior.terms if term.parameter.name not in names)
+        problem = replace(problem, prior=Prior(terms), fixed=dict(zip(names, (0.2, 0.6), strict=True)))
+    size, clock = 1.3, 1.7
+    alternative = Alternative("scales", "…", values=size, times=clock)
+    changed = changed_problem(problem, alternative)
+    random = np.random.default_rng(4)
+    rates, of_process = random.normal(0, 3, 12), np.array([0.2, 0.6])
+    at = Predicted(random.normal(0, 1, 12), rates, None, of_process)
+    there = Predicted(size * at.values, size / clock * rates, None, of_process * [size, clock])
+    before, after = problem.observations, changed.observations
+    assert after.cost(there) == pytest.approx(float(before.cost(at)), rel=1e-9)
+    scales = dict(zip(names, (size, clock), strict=True))
+    if held:
+        assert {name: changed.fixed[name] / problem.fixed[name] for name in names} == pytest.approx(scales)
+    else:
+        shift = dict(
+            zip(problem.prior.names, prior_shift(problem, tuple(_factors(problem, alternative).items())), strict=True)
+        )
+        assert {name: np.exp(shift.pop(name)) for name in names} == pytest.approx(scales)
+        assert not any(shift.values())
 
 
 def test_it_is_fitted_again_from_the_mode_where_a_search_from_the_prior_ends_elsewhere():

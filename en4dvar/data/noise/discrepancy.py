@@ -156,6 +156,14 @@ class DiscrepancyNoise(Noise):
     def matrices(self) -> dict[str, tuple[Array, str]]:
         return {} if self.correlation is None else self.correlation.record()
 
+    def scaled(self, values: float, times: float) -> "DiscrepancyNoise":
+        """With the amplitude times ``values`` and the length times ``times`` the covariance is values² times what it
+        was: g is that of a rate values/times as large.
+        """
+        beyond, of_clock = abs(values / times) * self.grows_beyond, abs(times)
+        kernel = replace(self.kernel, times=of_clock * self.kernel.times, grows_beyond=beyond)
+        return replace(self, std=abs(values) * self.std, time_std=of_clock * self.time_std, kernel=kernel)
+
     def covariance_of_errors(self, predicted: Predicted) -> Array:
         """R (…, K, K)."""
         s = self.error_std(predicted)

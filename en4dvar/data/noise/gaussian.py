@@ -165,6 +165,10 @@ class Noise:
         rest = slice(len(values), None)
         return predicted.values[rest], self.error_std(predicted)[rest]
 
+    def scaled(self, values: float, times: float) -> "Noise":
+        """The same errors of readings that are ``values`` times as large, at times that are ``times`` as long."""
+        return replace(self, std=abs(values) * self.std, time_std=abs(times) * self.time_std)
+
     def frozen(self, predicted: Predicted) -> "Noise":
         """Errors whose std is that at a prediction and depends on no state any more."""
         return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))

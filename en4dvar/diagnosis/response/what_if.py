@@ -210,13 +210,18 @@ def in_std_as_likely(shifts: Sequence[Shift]) -> Array:
 def changed_problem(problem: InverseProblem, alternative: Alternative) -> InverseProblem:
     """The problem under an alternative, but for the centres of priors; see :func:`prior_shift`."""
     o = problem.observations
-    noise = replace(
-        o.noise, std=abs(alternative.values) * o.noise.std, time_std=abs(alternative.times) * o.noise.time_std
-    )
+    noise = o.noise.scaled(alternative.values, alternative.times)
     observations = replace(o, values=alternative.values * o.values, times=alternative.times * o.times, noise=noise)
-    fixed = {name: value * alternative.parameters.get(name, 1.0) for name, value in problem.fixed.items()}
+    factors = _factors(problem, alternative)
+    fixed = {name: value * factors.get(name, 1.0) for name, value in problem.fixed.items()}
     fixed |= alternative.constants
     return replace(problem, model=alternative.model or problem.model, observations=observations, fixed=fixed)
+
+
+def _factors(problem: InverseProblem, alternative: Alternative) -> dict[str, float]:
+    """What is known of parameters times what: a discrepancy is stated on the scales of the readings and their times."""
+    scales = abs(alternative.values), abs(alternative.times)
+    return dict(zip((p.name for p in problem.discrepancy), scales, strict=False)) | dict(alternative.parameters)
 
 
 def prior_shift(problem: InverseProblem, factors: Sequence[tuple[str, float]]) -> Array:
@@ -252,7 +257,7 @@ def _shift(
 
     try:
         changed = changed_problem(problem, alternative)
-        of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
+        of_prior = prior_shift(problem, tuple(_factors(problem, alternative).items()))
         composite = Composite(changed, executor)
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
         return untold(f"cannot be set up: {error}")

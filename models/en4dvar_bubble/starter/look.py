@@ -159,6 +159,10 @@ UNCOUNTED = (
     "the minima behind are later ones ('trough 1' is not the first), and what a run makes of them may be wrong by a "
     "factor of 2: leave the file out, or recover those readings"
 )
+GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
+BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
+SHALLOW = 1.3  # of a minimum: readings beside it that are lower resolve it
+TALL = 0.5  # of R_max: a lower rebound is that of a collapse that may be steeper than it seems
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
@@ -170,6 +174,7 @@ class Look:
     ``top`` is where and how high the maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
+    ``trough`` is the minimum before the rebound where the readings resolve it, NaN else.
     ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
     ``begin`` is the first instant, ``step`` the median time between samples; ``falls`` tells whether the radius falls
     below :data:`COLLAPSED` of its maximum. ``n_minima`` follow the maximum with a ``prominence`` relative to the
@@ -186,6 +191,7 @@ class Look:
     rebound: float
     rest: float
     drift: str
+    trough: float
     before: tuple[float, float]
     n_minima: int
     prominence: float
@@ -196,6 +202,21 @@ class Look:
     start: Start
     reason: str
     clear: bool
+
+    @property
+    def resting(self) -> tuple[float, float, str]:
+        """R_eq: a median (m), the std of its logarithm, and where it is from. A bubble swings about it, so that it lies
+        above every minimum; where that is beyond what is usual, about their geometric mean with the maximum.
+        """
+        if np.isfinite(self.rest):
+            words = (
+                "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
+            )
+            return self.rest, 0.3, words
+        if self.trough > GAS_FRACTION * math.exp(BETWEEN * 0.4) * self.lobe.R_max:
+            words = "between the first minimum, which the readings resolve, and R_max, since no radius at rest is seen"
+            return math.sqrt(self.trough * self.lobe.R_max), 0.4, words
+        return GAS_FRACTION * self.lobe.R_max, 0.4, f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
 
 
 def look(times: Array, radius: Array, start: Start | None = None) -> Look:
@@ -233,7 +254,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses; "
         hole += UNCOUNTED if _unseen(times, radius) is None else COUNTED
     return Look(
-        float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
+        float(times[0]), peak, highest, step, noise, rebound, rest, drift, _trough(radius[largest:], rebound), rests,
         n_minima, prominence, falls, chosen == "laser" and not hole and (early or single(times, radius)), early,
         hole, chosen, reason, clear,
     )  # fmt: skip
@@ -391,6 +412,17 @@ def second_maximum(radius: Array) -> float:
     between = radius[int(indices[0]) : last + 1]
     peak = int(np.argmax(between))
     return float(between[peak] / radius[top]) if 0 < peak < len(between) - 1 else float("nan")
+
+
+def _trough(falling: Array, rebound: float) -> float:
+    """The least radius after the top, where a tall ``rebound`` is seen and the readings beside it are nearly as low.
+    About a collapse between two frames R ~ |t|^{2/5}, of the rebound times its height to the power 3/5, so that one of
+    them is at least 1.4 times as large.
+    """
+    least = int(np.argmin(falling))
+    resolved = rebound > TALL and 0 < least < len(falling) - 1
+    resolved = resolved and falling[least - 1 : least + 2].max() < SHALLOW * falling[least]
+    return float(falling[least]) if resolved else float("nan")
 
 
 def _start(first: float, rebounds: bool, creeps: bool, before: int) -> tuple[Start, str, bool]:

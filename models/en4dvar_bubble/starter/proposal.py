@@ -26,6 +26,7 @@ from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped, Together, ends_with
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, RELAXING, SPAN, STIFFENING, Guess, first_guess
 from en4dvar_bubble.starter.look import (
+    BETWEEN,
     COLLAPSED,
     TOP_WIDTH,
     Look,
@@ -62,10 +63,8 @@ LEAST_SHIFT = 0.1  # of the step between samples: of the prior of the clock
 TIMING = 0.05  # of the step between samples
 SAME_STEP = 1.1  # of films whose largest and smallest steps differ by less
 NUCLEUS = (0.66e-6, 0.8)  # m; both gels of Mancia et al. (2021), Table 1: 0.43 ± 0.31 and 1.3 ± 0.44 µm
-GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
 # Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
 WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess had a root mean square of 2.1
-BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: of a guessed clock
 COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
 EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
@@ -185,7 +184,7 @@ def propose(
 
 def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
     """Which of the observed numbers no gel gives, and what may be wrong then."""
-    rest = _text(_rest(look), "m", "um")
+    rest = _text(look.resting[0], "m", "um")
     told = {"t_c": "collapse time", "rebound": f"rebound to {look.rebound:.2f} R_max"}
     asked = {
         "t_c": "are scale and frame rate right?",
@@ -206,7 +205,8 @@ def _implausible(look: Look, coated: bool) -> str:
     power = round(math.log10(usual / R) / 3)
     factor = f"Units {1000 ** abs(power)} times {'larger' if power > 0 else 'smaller'} would make it a usual one"
     told = f"R_max {_text(R, 'm', 'um', 3)}, read every {_text(step, 's', 'us', 3)}"
-    return f"{told}: no bubble has such a radius; are the units of both columns right? {factor}"
+    seldom = "only ultrasound of small amplitude leaves a bubble" if BUBBLES[0] < R < BUBBLES[1] else "no bubble has"
+    return f"{told}: {seldom} such a radius; are the units of both columns right? {factor}"
 
 
 def starter(start: Start, law: str | None) -> Proposal:
@@ -272,11 +272,7 @@ def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     example |= {name: STIFFENING[0] for name in example if name == "alpha"}
     if model.start == "acoustic":
         return {**example, "R0": look.before[0] if np.isfinite(look.before[0]) else NUCLEUS[0]}
-    return {**example, "R_eq": _rest(look), "R_max": look.lobe.R_max}
-
-
-def _rest(look: Look) -> float:
-    return look.rest if np.isfinite(look.rest) else GAS_FRACTION * look.lobe.R_max
+    return {**example, "R_eq": look.resting[0], "R_max": look.lobe.R_max}
 
 
 def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Sequence[Look]) -> tuple[Entry, ...]:
@@ -481,10 +477,8 @@ def _radii(
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
     if look is not None and top is not None:
-        value, words = _of_each(_rest(look), look, top), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
-    if look is not None and np.isfinite(look.rest):
-        width = 0.3
-        words = "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
+        radius, width, words = look.resting
+        value = _of_each(radius, look, top)
     mean, std = top.R_max if top else ("maximum", 0.03)
     prior, source = f"{{prior: normal, mean: {mean}, std: {100 * std:.2g} %}}", "the errors of readings and scale"
     return [
