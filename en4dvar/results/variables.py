@@ -405,17 +405,22 @@ GROUPS: dict[str, Table] = {
 OPTIONAL = frozenset({"/fields", "/withheld", "/posterior_draws"})
 """Groups that a file may lack."""
 NAMED = ("parameter", "series")  # placeholders that stand for names of a user's
+LONGEST_NAME = 250  # bytes; netCDF allows 256
 
 
 def require_free_names(problem: InverseProblem) -> None:
-    """Raise :class:`ConfigError` where a parameter or series has the name of another variable, or of a dimension."""
+    """Raise :class:`ConfigError` where a parameter or series has the name of another variable, or of a dimension, or
+    one that is too long for a variable.
+    """
     subject = SimpleNamespace(problem=problem, parameters=problem.prior.parameters)
     for path, table in GROUPS.items():
         taken = {name for d in table for name in (d.name, *d.dims.split()) if "{" not in name}
         for declared in table:
             for item in SCOPES[declared.scope](subject) if declared.scope in NAMED else ():
                 name = declared.name.format(**item.names)
+                whose = f"the {declared.scope} {item.names[declared.scope]!r} needs another name"
                 if name in taken:
-                    whose = f"the {declared.scope} {item.names[declared.scope]!r} needs another name"
                     raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
+                if len(name.encode()) > LONGEST_NAME:
+                    raise ConfigError(f"{whose}: {name!r} is too long for a variable of the result")
                 taken |= set() if declared.when.words else {name}

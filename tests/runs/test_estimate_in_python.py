@@ -240,6 +240,14 @@ def test_a_name_that_the_result_has_itself_is_refused_before_anything_is_compute
     assert not runs
 
 
+@pytest.mark.parametrize("name", ["a" * 300, "é" * 150])
+def test_a_name_that_is_too_long_for_a_variable_is_refused(name):
+    with pytest.raises(en4dvar.ConfigError, match="is too long for a variable of the result"):
+        fit(lambda p, t: p[name] + 0 * t, priors={name: PRIORS["a"]})
+    with pytest.raises(en4dvar.ConfigError, match="is too long for a variable of the result"):
+        fit(lambda p, t: line(p, t), data={"time": TIMES, name: VALUES})
+
+
 def test_names_that_collide_with_each_other_are_refused(tmp_path):
     with pytest.raises(en4dvar.ConfigError, match="'a' needs another name: the result has another 'a_centre'"):
         fit(lambda p, t: p["a"] + p["a_centre"] * t, priors={"a": PRIORS["a"], "a_centre": PRIORS["b"]})
