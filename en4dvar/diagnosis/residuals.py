@@ -14,7 +14,7 @@ what they absorbed, P = S A⁻¹ Sᵀ, times √β as J has them, residuals in t
 
     Q = (I − B)(I − B)ᵀ + W^(−½) (P − P²) W^(−½),     B = W^(−½) P W^½,
 
-which is I − P where all weights are one.
+which is I − P where all weights are one. Readings that hardly count leave the fit to the prior, and are far off.
 """
 
 import math
@@ -87,23 +87,37 @@ class Residuals:
         return np.asarray(np.sum(self.absorbed**2, axis=1))
 
     @cached_property
+    def fitted(self) -> tuple[Array, Array]:
+        """F (K, s) and M (s, s) with Q = I + F M Fᵀ."""
+        L, identity = self.absorbed, np.eye(self.absorbed.shape[1])
+        if self.weights is None:
+            return L, -identity
+        root = np.sqrt(self.weights)[:, None]
+        within = (L * root).T @ (L * root) + identity - L.T @ L
+        return np.hstack([L / root, L * root]), np.block([[within, -identity], [-identity, 0 * identity]])
+
+    @cached_property
     def expected(self) -> Array:
         """Q (K, K); of many readings it would fill the memory."""
-        absorbed = self.absorbed @ self.absorbed.T
-        if self.weights is None:
-            return np.eye(len(self.white)) - absorbed
-        root = np.sqrt(self.weights)
-        left = np.eye(len(root)) - absorbed * (root / root[:, None])
-        return np.asarray(left @ left.T + (absorbed - absorbed @ absorbed) / np.outer(root, root))
+        F, M = self.fitted
+        return np.asarray(np.eye(len(self.white)) + F @ M @ F.T)
+
+    @cached_property
+    def chi2_like(self) -> tuple[float, float]:
+        """Factor g and degrees of freedom h of the g χ²_h with mean and variance of eᵀe (Satterthwaite 1946, Biometrics
+        Bull. 2, 110).
+        """
+        F, M = self.fitted
+        change = M @ (F.T @ F)
+        mean = len(self.white) + float(np.trace(change))
+        half_variance = mean + float(np.trace(change) + np.sum(change * change.T))
+        return half_variance / mean, mean**2 / half_variance
 
     @cached_property
     def studentised(self) -> Array:
         """Residuals (K,) over their own expected std; 0 of a reading that only its own prediction is fitted to."""
-        left = 1 - self.leverage
-        if self.weights is not None:  # the diagonal of Q
-            L = self.absorbed
-            mixed = L.T @ (self.weights[:, None] * L) - L.T @ L
-            left = left - self.leverage + (self.leverage + np.sum(L @ mixed * L, axis=1)) / self.weights
+        F, M = self.fitted
+        left = 1 + np.sum(F @ M * F, axis=1)
         return np.where(left > FITTED, self.white / np.sqrt(np.maximum(left, FITTED)), 0.0)
 
     @property
@@ -141,8 +155,8 @@ class Residuals:
     @cached_property
     def runs_chance(self) -> float:
         """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147);
-        1 where no reading follows another."""
-        if not self.follows.any():
+        1 where no reading follows another, or the prior's pull on a fit of other weights gives residuals a sign."""
+        if self.weights is not None or not self.follows.any():
             return 1.0
         count, expected = self.runs
         n = len(self.white)

@@ -358,11 +358,12 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
 
 
 def ranked(scores: Sequence[S]) -> list[S]:
-    """The scores with the difference of their log-evidence from the best one, and their probabilities, which nobody
-    knows (NaN) where one evidence is not known.
+    """The scores with the difference of their log-evidence from the best one, and their probabilities among those whose
+    evidence is known; none (NaN) of one alone.
     """
     evidence = np.array([s.log_evidence for s in scores])
     difference = evidence - evidence[np.isfinite(evidence)].max(initial=-np.inf)
-    odds = np.exp(difference)  # the models are equally probable before the data
-    judged = zip(scores, difference.tolist(), (odds / np.sum(odds)).tolist(), strict=True)
+    # the models are equally probable before the data
+    odds = np.exp(difference) if np.sum(~np.isnan(evidence)) > 1 else np.full(len(evidence), np.nan)
+    judged = zip(scores, difference.tolist(), (odds / np.nansum(odds)).tolist(), strict=True)
     return [replace(s, difference=d, probability=p) for s, d, p in judged]

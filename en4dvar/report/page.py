@@ -28,6 +28,7 @@ from en4dvar.report.text import figure_text, number_like, plain_number, pretty_u
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
+OF_WEIGHTS = "of readings that count with other weights than one it may be larger than their errors say", False
 UNRELATED = (0.025, 0.975)  # chances of a correlation of neighbours of which nothing is said
 IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
@@ -41,6 +42,8 @@ def render_set(
     judged, recorded = result.group("sample_stats"), json.loads(str(result.attributes["assimilation_settings"]))
     stats, structured = judged.attrs, any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2, dfs = float(stats["chi2_per_observation"]), float(stats["dfs"])
+    weights = result.of_readings("observed_data", "weights", shared=True)
+    weighted = bool(np.any((weights != 0) & (weights != 1)))
     change = (str(stats["varying"]), float(stats["log_evidence_change"])) if "log_evidence_change" in stats else None
     return render(
         "set.html.j2",
@@ -52,7 +55,7 @@ def render_set(
         stated=[row.label for row in result.rows if _as_stated(row)],
         lead=[row for row in result.rows if not _as_stated(row)],
         trust=trust(result),
-        chi2_words=judge_chi2(chi2, int(stats["n_weighted"]), dfs, structured),
+        chi2_words=OF_WEIGHTS if weighted else judge_chi2(chi2, int(stats["n_weighted"]), dfs, structured),
         shares=SHARES if "variance_from_errors" in judged else (),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
@@ -68,7 +71,7 @@ def render_set(
         diagnostics=[d.name for d in ITERATIONS if not d.scope and d.name != "active"],
         fixed_values=result.group("constant_data").variables.values(),
         settings=recorded,
-        weights=result.of_readings("observed_data", "weights", shared=True),
+        weights=weights,
     )
 
 

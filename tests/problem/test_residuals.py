@@ -8,6 +8,7 @@ from diagnosis.provoked import bent, run, spiked
 from scipy.special import digamma, fdtrc, fdtri
 from toys import with_discrepancy
 
+from en4dvar.diagnosis.honesty.checks import fit
 from en4dvar.diagnosis.residuals import Residuals, positive_chance
 from en4dvar.report.page import judge_chi2
 
@@ -57,6 +58,28 @@ def test_weights_make_no_reading_odd():
     for chances in ([r.lag_one_chance for r in found], [r.collapse_chance for r in found]):
         assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 300))
     assert np.mean([r.outlier[1] < 0.05 for r in found]) < 0.09
+
+
+def test_a_fit_of_small_weights_is_no_misfit():
+    """`weights: mean`: the prior holds the fit, so that χ² is larger. One of 20 right fits was called a misfit here."""
+    rng, k = np.random.default_rng(6), 50
+    weights, times = np.full(k, 1 / k), np.linspace(0.2, 2, k)
+    plain = 2.0 * np.column_stack([times, times**2])
+    sensitivity = np.sqrt(47 * weights)[:, None] * plain
+    fitted = sensitivity @ np.linalg.solve(47 * np.eye(2) + sensitivity.T @ sensitivity, sensitivity.T)
+    squares = []
+    for _ in range(2000):
+        y = np.sqrt(weights) * (plain @ rng.standard_normal(2) + rng.standard_normal(k))
+        found = Residuals.of(y - fitted @ y, sensitivity, 47, times, np.arange(k), weights=weights)
+        squares.append(found.white @ found.white)
+    factor, degrees = found.chi2_like
+    assert np.mean(squares) == pytest.approx(factor * degrees, rel=0.03)
+    assert np.var(squares) == pytest.approx(2 * factor**2 * degrees, rel=0.15)
+    assert factor * degrees > 1.2 * (k - found.dfs)
+    told = [[c.code for c in fit(square, k, k - degrees, factor)] for square in squares]
+    assert sum(map(bool, told)) < 20  # of 2 expected of a χ²; its tail is heavier
+    assert sum(bool([*fit(square, k, found.dfs)]) for square in squares) > 60
+    assert found.runs_chance == 1
 
 
 def test_imhof_of_few_numbers():

@@ -101,7 +101,7 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     assert comparison_table(compare_runs(runs)) in done.output
 
 
-def test_no_probability_is_told_beside_an_evidence_that_is_not_known():
+def test_no_probability_is_told_of_the_only_evidence_that_is_known():
     """The one of two models whose evidence is known had the probability 1."""
     scores = [ModelScore(run, "gel", e, np.nan, np.nan, 1.0, 2.0, 0.9) for run, e in (("a", np.nan), ("b", 2.0))]
     comparison = Comparison(tuple(ranked(scores)))

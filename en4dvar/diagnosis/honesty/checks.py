@@ -65,13 +65,13 @@ def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
         yield caution("rank-deficient", f"{alive}, too few for the covariance of {n} parameters")
 
 
-def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
+def fit(chi2: float, n_observations: int, total_dfs: float, factor: float = 1.0) -> Findings:
     """A residual χ² (the sum over the observations) that R does not explain. At the minimum its expectation is K − DFS,
-    not K (Talagrand 1999): the fit has absorbed DFS of the noise.
+    not K (Talagrand 1999): the fit has absorbed DFS of the noise. ``factor``: it is so many times a χ².
     """
     degrees = max(1.0, n_observations - total_dfs)
-    low, high = diag.chi2_interval(degrees)
-    words = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
+    low, high = (factor * end for end in diag.chi2_interval(degrees))
+    words = f"χ² of the residuals is {chi2:.3g} where about {factor * degrees:.3g} is expected"
     if not chi2 <= high:
         yield caution("misfit", f"{words}: the model does not explain the data within the stated observation error")
     elif chi2 < low and n_observations - total_dfs > 1:

@@ -50,7 +50,10 @@ def examine(
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     members = a.posterior[alive]
-    (chi2, dfs), n_used = a.fit, len(a.problem.observations.used)
+    (chi2, dfs), n_used, factor = a.fit, len(a.problem.observations.used), 1.0
+    if a.residuals is not None and a.residuals.weights is not None:
+        factor, degrees = a.residuals.chi2_like
+        dfs = n_used - degrees
     of_events = n_used == len(a.problem.observations) and all(part.observable.event for part in a.problem.parts)
     whole = control.costs is not None  # the ensembles stand for the whole covariance
     warnings = (
@@ -65,7 +68,7 @@ def examine(
         *checks.loss("prior forecast", a.prior_failures, prior, control.prior, of_events, bool(a.refinement)),
         *checks.loss("iterations", worst_loss, prior, None, of_events, bool(a.refinement)),
         *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior, of_events),
-        *checks.fit(chi2 * n_used, n_used, dfs),
+        *checks.fit(chi2 * n_used, n_used, dfs, factor),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
         *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing) if whole else ()),
