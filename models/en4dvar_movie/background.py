@@ -19,6 +19,7 @@ from en4dvar_movie.surfaces import FLICKER, flashes_first, is_round, smooth_surf
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
 CORNERS = 0.01  # share of the tiles that are brighter yet, where a larger change is a bubble's or a flash's
+UNLIT = -0.9  # of the brightness: what a lamp may lack before a frame is black
 TOP, MANY = 90, 0.4  # per cent of the tiles that are not the brightest; the share of tiles that tells the light
 ALIKE, CLOSE = 4.0, 0.05  # std of noise, or of the brightness, by which tiles in one light may differ
 LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by their lamp
@@ -105,7 +106,7 @@ class Background:
         alike = tiles > np.percentile(tiles, TOP) - apart
         change = float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
         brighter = np.mean((tiles > change + apart) & (tiles != 0))
-        return change if abs(change) <= FLICKER or (brighter < CORNERS and not white) else 0.0
+        return max(change, UNLIT) if abs(change) <= FLICKER or (brighter < CORNERS and not white) else 0.0
 
     def steadied(self, image: Array, tiles: Array, bubble: Circle, contrast: float) -> Array:
         """The image at the background's own brightness: what the light does far from the bubble is taken out.

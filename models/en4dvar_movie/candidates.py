@@ -67,7 +67,7 @@ def look_at(
     else:
         places = [place for place, _ in locate(tiles, background.noise / TILE)]
     if not places:
-        return Look(number, (), "no bubble: nothing differs from the background", spot)
+        return Look(number, (), "no bubble: nothing that has an outline differs from the background", spot)
     candidates: list[Candidate] = []
     for place in places:
         steady = background.steadied(image, tiles, place, optics.contrast)

@@ -276,3 +276,12 @@ def test_frames_with_a_subtracted_background_say_what_to_do_and_that_helps():
         track(movie_of(list(shown)))
     found = track(movie_of(list(shown - shown.min())))
     assert [r.radius for r in found.readings if r.used] == pytest.approx(RADII[:2], abs=0.2)
+
+
+def test_a_black_frame_is_no_flash():
+    """Divided by its own brightness it was endlessly bright."""
+    shown = frames(Scene((64, 64)), np.array([18.0, 17.0, 15.0, 12.0]))
+    shown[4] = np.zeros_like(shown[4])
+    reading = track(movie_of(shown)).readings[4]
+    assert not reading.used
+    assert reading.reason == "no bubble: nothing that has an outline differs from the background"
