@@ -176,7 +176,7 @@ def test_two_equal_bubbles_are_one_at_a_wall(apart, tmp_path):
     assert np.abs(pair - R[1:]).max() < 1e-4 * 10e-6
 
 
-@pytest.mark.parametrize(("wall", "near"), [(Wall(450e-6, "rigid"), True), (None, False)])
+@pytest.mark.parametrize(("wall", "near"), [(Wall(450e-6), True), (Wall(5.7 * 200e-6), True), (None, False)])
 def test_a_slow_collapse_in_a_liquid_proposes_a_wall_that_may_be_near_or_far(wall, near):
     times = np.arange(0, 90e-6, 0.5e-6)
     R = path(wall, times=times)

@@ -32,6 +32,10 @@ SLOW = 1.08, 1.3
 """Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby, and where it takes longer than
 the second, the liquid is viscous: a wall at 1.1 R_max makes it 1.19."""
 
+SLOW_IN_WATER = 1.05
+"""The first of them where the viscosity is known: without a wall it is 1.042 − 1.25 S/(R_max p_∞) + 1.6/Re by forward
+runs (50 to 1200 µm, R_eq up to 0.2 R_max). The rest is for scale, pressure and top; a wall at 5.7 R_max adds 0.036."""
+
 WALLS = 8.0, 200.0
 """Median of a wall's distance, in R_max, and the largest, where a collapse takes 0.1 % longer."""
 

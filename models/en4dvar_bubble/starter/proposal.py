@@ -155,7 +155,7 @@ def propose(
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     elif "G" in guess.values:
         believed = Guess({}, {}, 0.0)  # of a gel that a pulse stretches, readings tell G α/R0 alone
-    slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
+    slow = (elsewhere.SLOW_IN_WATER if medium == "water" else elsewhere.SLOW[0]) < ratio < elsewhere.SLOW[1]
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
     rest = at_rest(looks, histories, edge, scale.log_std)
