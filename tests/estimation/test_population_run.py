@@ -205,13 +205,12 @@ def linear(seed: int = 4) -> list:
     rng, model = np.random.default_rng(seed), Vectorised()
     truths = [(1.0 + 0.5 * rng.standard_normal(), 0.4 + 0.1 * s) for s in range(SETS)]
     a, b = model.parameters
-    return [
-        replace(
-            make_problem(model, truth, std=STD, seed=s, k=4 + s % 3),
-            prior=Prior((PriorTerm.normal(a, 0.6, 0.9), PriorTerm.normal(b, 0.2 + 0.1 * s, 0.5 - 0.05 * s))),
-        )
-        for s, truth in enumerate(truths)
-    ]
+    problems = []
+    for s, truth in enumerate(truths):
+        problem = make_problem(model, truth, std=STD, seed=s, k=4 + s % 3)
+        prior = Prior((PriorTerm.normal(a, 0.6, 0.9), PriorTerm.normal(b, 0.2 + 0.1 * s, 0.5 - 0.05 * s)))
+        problems.append(replace(problem, prior=prior, observations=replace(problem.observations, name=f"set{s}")))
+    return problems
 
 
 def exact(problems, hyper):

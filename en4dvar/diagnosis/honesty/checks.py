@@ -46,7 +46,8 @@ CLOCK = "on the clock of the data"  # which shows another time than the model's,
 NONE: Mapping[str, str] = MappingProxyType({})
 ONE_SIDED = 1.645  # standard deviations below which 5 % of a Gaussian lie
 REACHES = 5.0  # times below its median where a prior still has 5 %: its lower end stands for a value of zero
-AS_WELL = 1 / 3  # ratio of evidences from which on data are explained as well: what is less speaks for one of the two
+LOWEST = 0.1  # of a posterior: what stands for its density where its prior ends
+EVEN = 1 / 3  # density below half of the median over that up to it: what is less is that of a small value, known well
 Findings = Iterator[Caution]
 
 
@@ -299,21 +300,20 @@ def limits(prior: Prior, sample: Array, members: Array, silent: Collection[str])
 
     With u the share of the prior below a value, the density of u in the posterior at u = 0 is the evidence of the model
     with the lowest value over that of any (Dickey 1971, Ann. Math. Stat. 42, 204). Other parameters may make up for it:
-    of G and α the readings may know the product alone. It is counted below half of the median of u, and stands for that
-    at zero only where it is as high as next to the median: a small value may be known well.
+    of G and α the readings may know the product alone. It is that of the lowest tenth of the posterior, and stands for
+    that at zero only where it is about as high as next to the median: a small value may be known well.
     """
     for j, (name, term) in enumerate(zip(prior.names, prior.terms, strict=True)):
         low, middle = term.to_physical(term.mean + term.std * np.array([-ONE_SIDED, 0.0]))
         if name in silent or min(term.parameter.bounds[0], low) < 0 or REACHES * low > middle:
             continue
         u = np.array([NormalDist(term.mean, term.std).cdf(x) for x in sample[:, j]])
-        half = float(np.median(u)) / 2
-        below = float(np.mean(u < half))
-        if min(below / half, 4 * below) > AS_WELL:
+        ratio = LOWEST / max(float(np.quantile(u, LOWEST)), 1e-12)
+        if ratio >= 1 and 4 * float(np.mean(u < np.median(u) / 2)) > EVEN:
             most = shown(float(diag.member_quantiles(members[:, j], (0.95,))[0]), term.parameter)
             words = (
                 f"the readings limit {name} only from above: the lowest values that its prior allows, with whatever "
-                f"values of other parameters go with them, explain them as well (evidence ratio {below / half:.2g}); "
+                f"values of other parameters go with them, explain them as well (evidence ratio {ratio:.2g}); "
                 f"with this prior {name} is below {most} with a probability of 95 %"
             )
             yield caution("upper-limit", words, parameters=(name,))
