@@ -174,7 +174,7 @@ def test_members_do_not_influence_each_other(radial):
             np.testing.assert_array_equal(alone[name][0], together[name][i], name)
 
 
-@pytest.mark.parametrize("sure", [True, False])
+@pytest.mark.parametrize("sure", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_run_accepts_what_is_not_random(tmp_path, sure):
     times = np.linspace(0, 300, 31)
     radii = simulate(

@@ -62,7 +62,7 @@ def test_the_closed_form(std, about, correlated):
 
 
 @pytest.mark.parametrize(
-    ("std", "about", "correlated"), CASES[:2] + [pytest.param(*case, marks=pytest.mark.slow) for case in CASES[2:]]
+    ("std", "about", "correlated"), CASES[:1] + [pytest.param(*case, marks=pytest.mark.slow) for case in CASES[1:]]
 )
 def test_nested_sampling_of_the_closed_form(std, about, correlated):
     """0.02 nats from 1 to 12 nats, with an error that is stated: importance sampling is all that is left of it."""

@@ -211,6 +211,7 @@ def test_the_command_gives_the_others_and_fails(quiet, tmp_path):
     assert row("pack-damaged").told(done.stderr)
 
 
+@pytest.mark.slow
 def test_many_names_are_counted(quiet, tmp_path):
     path, run = make_campaign(tmp_path, MOST_NAMES + 4), tmp_path / "run"
     run_campaign(configuration(path, run))

@@ -83,7 +83,7 @@ def test_an_aperture_is_told_where_the_bubble_covers_the_brightest_of_a_vignette
     assert np.abs(off).max() < 0.1
 
 
-@pytest.mark.parametrize("moves", [0.0, 6.0])
+@pytest.mark.parametrize("moves", [0.0, pytest.param(6.0, marks=pytest.mark.slow)])
 def test_an_outline_that_stands_still_in_all_frames_is_told(moves):
     radii = 40 + moves * np.sin(np.arange(12.0))[:, None]
     found = track(movie_of(list(render(radii, Scene(noise=2.0, before=0), np.random.default_rng(1)))))

@@ -41,7 +41,7 @@ def config(monkeypatch):
 TIMES = np.arange(12) * 1e-5
 
 
-@pytest.mark.parametrize("name", ["m.tif", "m.mp4"])
+@pytest.mark.parametrize("name", ["m.tif", pytest.param("m.mp4", marks=pytest.mark.slow)])
 def test_the_movie_shows_the_simulated_radii(config, tmp_path, name):
     settings = {"pixel": "2 um", "exposure": "500 ns", "centre": "0.4", "dirt": "8", "drift": "0.1", "noise": "4"}
     words = film(config, TIMES, tmp_path / name, settings, 3)

@@ -145,7 +145,7 @@ def test_half_a_disc_at_a_wall_is_told_from_a_needle_that_reaches_into_it(radii)
     assert np.median([r.errors.std for r in result.readings]) < 0.1
 
 
-@pytest.mark.parametrize("unread", [1, 4])
+@pytest.mark.parametrize("unread", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_several_frames_that_cannot_be_read_make_what_stands_still_doubtful(unread):
     radii = [30.0, 26, 22, 18, 15, *[12.0] * 10]
     frames = filmed(0.0, radii)

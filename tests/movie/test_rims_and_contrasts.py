@@ -97,7 +97,7 @@ def test_a_rim_with_which_no_outline_can_be_fitted_again_is_left_out(monkeypatch
     assert len(calls) == 2
 
 
-@pytest.mark.parametrize("ratio", [8.0, 15.0])
+@pytest.mark.parametrize("ratio", [8.0, pytest.param(15.0, marks=pytest.mark.slow)])
 def test_a_rim_beside_noise_moves_radii_less_than_what_they_are_said_to_share(ratio):
     off, std, common = errors(filmed(gaussian(0.25, 3.0, 1.5), ratio=ratio, seed=3))
     assert abs(np.median(off)) < 0.5 * np.median(common)

@@ -79,7 +79,7 @@ def test_a_saturated_middle_of_a_bubble_in_an_aperture_is_not_the_bubble(spot, e
     assert np.nanmax(np.abs(off(readings))) < 0.2
 
 
-@pytest.mark.parametrize("aside", [0.0, pytest.param(11.0, marks=pytest.mark.slow), 13.0])
+@pytest.mark.parametrize("aside", [0.0, *(pytest.param(aside, marks=pytest.mark.slow) for aside in (11.0, 13.0))])
 def test_a_frame_in_which_the_laser_s_light_covers_a_part_of_the_outline_is_doubtful(aside):
     images = filmed(empty=3)
     images[3] = images[3] + 2000 * np.exp(-0.5 * ((X - CENTRE[0] - aside) ** 2 + (Y - CENTRE[1]) ** 2) / 2.2**2)
@@ -89,7 +89,7 @@ def test_a_frame_in_which_the_laser_s_light_covers_a_part_of_the_outline_is_doub
     assert first.used or first.reason.startswith("light: a part of the outline is saturated")
 
 
-@pytest.mark.parametrize("empty", [0, 4])
+@pytest.mark.parametrize("empty", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_luminous_bubble_beside_a_bright_needle_is_no_field_of_view(empty):
     radii = 20 + 1.7 * np.sin(np.arange(16))
     needle = (X < 45) & (np.abs(Y - 47) < 3)

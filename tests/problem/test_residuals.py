@@ -188,8 +188,8 @@ def test_the_outlier_of_an_exact_fit_is_that_of_least_squares():
     assert residuals.outlier == (4, pytest.approx(chance, rel=1e-6))
 
 
-@pytest.mark.parametrize("freedom", [3.43, 12.0, 30.0, 110.0])
-@pytest.mark.parametrize("count", [8, 30, 100])
+@pytest.mark.parametrize("freedom", [3.43, *(pytest.param(of, marks=pytest.mark.slow) for of in (12.0, 30.0)), 110.0])
+@pytest.mark.parametrize("count", [8, pytest.param(30, marks=pytest.mark.slow), 100])
 def test_a_right_reading_is_odd_no_more_often_than_told_where_the_size_of_the_errors_is_estimated(freedom, count):
     """A posterior of more squares than there are residuals holds these and what was known before; one of fewer, as
     beside a discrepancy, is of another size than that of the residuals, each of which may be larger than it allows.

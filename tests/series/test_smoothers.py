@@ -144,8 +144,8 @@ def test_enrts_is_the_kalman_smoother_with_model_error(size, std, inflation, rot
     assert np.abs(np.mean([spread for _, spread in found], axis=0)).max() < 0.2
 
 
-@pytest.mark.parametrize("size", [1, 2])
-@pytest.mark.parametrize("smoother", [EnKS(3), EnKS(10), EnRTS()])
+@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("smoother", [EnKS(3), pytest.param(EnKS(10), marks=pytest.mark.slow), EnRTS()])
 def test_what_draws_leave_falls_with_the_members(smoother, size):
     """As 1/√N: of the EnKS in mean and spread, of the EnRTS in the spread."""
     few, many = (
