@@ -132,9 +132,10 @@ class Forecast:
     def __len__(self) -> int:
         return len(self.failures)
 
-    def __getitem__(self, members: slice) -> "Forecast":
-        rows = ("predicted", "path", "failures", "extremes", "beyond")
-        return replace(self, **{name: getattr(self, name)[members] for name in rows})
+    def __getitem__(self, members: slice | Indices) -> "Forecast":
+        rows = {name: getattr(self, name)[members] for name in ("predicted", "path", "extremes", "beyond")}
+        failures = tuple(self.failures[i] for i in np.arange(len(self.failures))[members])
+        return replace(self, **rows, failures=failures)
 
 
 class Composite:

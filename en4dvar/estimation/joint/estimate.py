@@ -161,7 +161,10 @@ class _Estimate:
         without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         members, cautions = self._members(lowest, drawn=self.samples and not without)
         grids, stage = tuple(map(plotting_times, joint.experiments)), "forecast of the joint posterior"
-        forecasts = self._forecasts(members, lowest.at.place, grids)
+        forecasts = tuple(
+            experiment.run(_points(joint, members, lowest.at.place, experiment.e), grids[experiment.e])
+            for experiment in experiments
+        )
         needed = math.ceil(self.settings.min_active_fraction * len(members.border))
         for problem, run in zip(joint.experiments, forecasts, strict=True):
             require_members(problem, run[:-1], needed, stage)
@@ -171,7 +174,7 @@ class _Estimate:
         if any(lost):
             if (alive := active_members(lost)).sum() >= needed:  # else no interval is trusted
                 members = members.of(alive)
-                forecasts = self._forecasts(members, lowest.at.place, grids)
+                forecasts = tuple(run[np.flatnonzero([*alive, True])] for run in forecasts)  # the mode is last
             advice = "the posterior holds only where all models run: find out why they fail, or give narrower priors"
             cautions += [replace(c, advice=advice) for c in checks.loss(stage, lost, Prior(()))]
         cautions += missing_readings(max(forecast.filled for forecast in forecasts))
@@ -210,10 +213,6 @@ class _Estimate:
             agreement=agreed,
             without=without,
         )
-
-    def _forecasts(self, members: JointMembers, mode: Place, grids: Sequence[Array]) -> tuple[Forecast, ...]:
-        each = zip(self.experiments, grids, strict=True)
-        return tuple(e.run(_points(self.joint, members, mode, e.e), grid) for e, grid in each)
 
     def _without(
         self, cost: float, singles: Sequence[Single], said: Sequence[Statement], alone: Array, most: int
