@@ -60,6 +60,9 @@ FIRST = (
     "test_commands", "test_ending_models", "test_twin", "test_estimate", "test_imr_suite",
 )  # fmt: skip
 
+# Fixtures of a module that take minutes.
+COSTLY = {"test_study": {"small", "twin"}}
+
 FAILED = 3
 
 PARAMETERS = (
@@ -172,11 +175,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--turn", type=int, help="a sixteenth of the tests, of the long ones a thirtieth: those of a turn")
 
 
+def _name_in_turn(item: pytest.Item) -> str:
+    """The name by which a long test is of a part: where a fixture takes minutes, all that share it are of one part."""
+    shared = sorted(COSTLY.get(item.path.stem, set()) & set(item.fixturenames))  # type: ignore[attr-defined]
+    return "::".join([*shared, item.path.stem]) if shared else item.nodeid
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep the tests of the turn that is asked for; :data:`FIRST`, files with long tests, then those with the most."""
     long = {item.nodeid for item in items if item.get_closest_marker("long")}
     if (turn := config.getoption("--turn")) is not None:
-        items[:] = [item for item in items if is_of_part(item.nodeid, turn, 30 if item.nodeid in long else 16)]
+        names = {item: (_name_in_turn(item), 30) if item.nodeid in long else (item.nodeid, 16) for item in items}
+        items[:] = [item for item in items if is_of_part(names[item][0], turn, names[item][1])]
     tests, begun_first = Counter(item.path for item in items), {item.path for item in items if item.nodeid in long}
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], item.path not in begun_first, -tests[item.path]))
