@@ -150,7 +150,7 @@ def _concluded(
             log_evidence = ends.drawn.log_evidence - observations.log_normalisation()
         else:  # by Laplace
             log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
-    std = ends.members.std(axis=0, ddof=1)
+    std = ends.members[ends.run.active].std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
     judged, freedom = conclusions.with_posterior_scale(space, linear, descent.weights.w, ends.members)
     begun = space.forward_runs  # those of fits are told with the shifts
@@ -172,7 +172,7 @@ def _concluded(
         own_std=observations.noise.error_std(central),
         trajectory_times=stages.grid,
         iterations=descent.records,
-        dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, ends.members),
+        dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, ends.members[ends.run.active]),
         converged=descent.converged,
         stop_reason=descent.stop,
         forward_runs=space.forward_runs,

@@ -60,6 +60,7 @@ def test_members_that_fail_are_no_part_of_the_posterior():
     assert [bool(reason) for reason in found.posterior_failures] == lost.tolist()
     assert np.isnan(found.posterior[lost]).all()
     np.testing.assert_allclose(found.survivors, whole.posterior[~lost], rtol=0, atol=1e-9)
+    assert found.dfs_per_parameter == pytest.approx(1 - found.survivors.var(axis=0) / found.prior.var(axis=0), rel=1e-6)
 
 
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])
