@@ -119,9 +119,9 @@ def _through(stages: Stages) -> Analysis:
     analysis = replace(analysis, cautions=told((*cautions, *lost)) if lost else doubts)
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
-        widened = with_shifts(ends.members, analysis.what_if, stages.seed)
-        alive = ends.run.active[:, None]
-        analysis = replace(analysis, posterior=np.where(alive, prior.to_physical(widened), np.nan))
+        alive, posterior = ends.run.active, np.full_like(ends.members, np.nan)
+        posterior[alive] = prior.to_physical(with_shifts(ends.members[alive], analysis.what_if, stages.seed))
+        analysis = replace(analysis, posterior=posterior)
     return analysis
 
 

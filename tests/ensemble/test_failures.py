@@ -9,7 +9,7 @@ from toys import Fragile, Linear, make_problem
 
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.assimilate import assimilate, cost, forecast
-from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.model.forward import Alternative, ForwardModel, Observable
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import PriorTerm
@@ -61,6 +61,18 @@ def test_members_that_fail_are_no_part_of_the_posterior():
     assert np.isnan(found.posterior[lost]).all()
     np.testing.assert_allclose(found.survivors, whole.posterior[~lost], rtol=0, atol=1e-9)
     assert found.dfs_per_parameter == pytest.approx(1 - found.survivors.var(axis=0) / found.prior.var(axis=0), rel=1e-6)
+
+
+def test_what_is_assumed_widens_the_members_that_are_alive():
+    problem = make_problem(Fragile(-1.0, names=NAMES), TRUTH)
+    problem.model.alternatives = (Alternative("scale", "the scale were off", values=1.2),)
+    plain, added = (assimilate(problem, settings("bundle", what_if=what), 3) for what in (True, "added"))
+    lost = np.array([bool(reason) for reason in added.posterior_failures])
+    assert lost.any()
+    np.testing.assert_array_equal(np.isnan(added.posterior).all(axis=1), lost)
+    (shift,) = added.what_if
+    wanted = np.cov(plain.survivors.T) + np.exp(-max(0.0, shift.cost_change)) * np.outer(shift.change, shift.change)
+    np.testing.assert_allclose(np.cov(added.survivors.T), wanted, rtol=1e-9)
 
 
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])
