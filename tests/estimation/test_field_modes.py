@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from field_models import READ, TIMES, VALUES, Line
+from field_models import READ, TIMES, VALUES, Fragile, Line
 from kuramoto import CELLS, Kuramoto, write_ring
 from kuramoto import NU as TRUE_NU
 from kuramoto import READ as CELLS_READ
@@ -28,9 +28,9 @@ CORRELATED = ("energy_std: 0.05", "energy_std: 0.05, correlation_time: 3")
 STD, LEVEL = 0.3, np.array([4.0, 4.2])
 
 
-def line(**prior) -> InverseProblem:
+def line(model: Line | None = None, **prior) -> InverseProblem:
     """Readings of cells and of the mean of three cells with an offset, which have no place."""
-    model = Line()
+    model = model or Line()
     u, level = model.observables
     series = [
         Series(u, TIMES, VALUES, noise_of(np.full(6, STD)), places=Places.at_indices(READ)),
@@ -61,6 +61,14 @@ def test_a_linear_field_with_a_parameter_and_a_reading_of_no_place_is_the_closed
     assert np.max(np.abs(field.prior_std - 1)) < 2e-3
     assert analysis.posterior[:, 0].mean() == pytest.approx(mean[30], abs=1e-3 * std[30])
     assert analysis.posterior[:, 0].std(ddof=1) == pytest.approx(std[30], rel=1e-3)
+
+
+def test_cells_of_members_that_fail_are_no_part_of_the_field():
+    analysis = assimilate(line(Fragile()), AssimilationSettings(members=40, min_active_fraction=0.2), 1)
+    (field,), lost = analysis.fields, np.array([reason != "" for reason in analysis.posterior_failures])
+    assert 0 < lost.sum() < 30
+    np.testing.assert_array_equal(np.isnan(field.members).any(axis=1), lost)
+    assert field.std == pytest.approx(field.members[~lost].std(axis=0, ddof=1), rel=1e-9)
 
 
 def test_modes_that_the_readings_do_not_tell_are_counted_in_one_warning():
