@@ -2,8 +2,9 @@
 
 It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
-the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
-observations, the iterations, the descents and the modes stay in ``datasets.pack``.
+the observation times a variable; so is ``G_piece``, where the pieces of a parameter begin that varies at knots of each
+data set. Scalars that judge a fit become variables of ``sample_stats``. The paths between the observations, the
+iterations, the descents and the modes stay in ``datasets.pack``.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ GROUPS = (
 _PATHS = frozenset(f"/{name}" for name in GROUPS)
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
+PIECE = "_piece"  # ends the dimension, and the coordinate, of the pieces of a parameter that varies
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
@@ -153,12 +155,12 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
         group.createDimension("dataset", n_datasets)
         kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
-            group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
+            group.createDimension(_dimension(dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
         about = {"units": "1", "long_name": "data set"}
         netcdf.define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
         for key, variable in kept.items():
-            own = key not in variable.dims or key == "time"  # of each data set
-            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
+            own = key not in variable.dims or _dimension(key) != key  # of each data set
+            dims = tuple(map(_dimension, variable.dims))
             kind, dims = variable.values.dtype, ("dataset", *dims) if own else dims
             made = netcdf.define_variable(group, key, kind, dims, netcdf.attributes_of(variable), missing=own)
             if not own:
@@ -167,6 +169,11 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
             netcdf.define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
+
+
+def _dimension(dim: str) -> str:
+    """What a dimension is called whose coordinate is a variable, for data sets differ in it."""
+    return f"{dim}_number" if dim.endswith(PIECE) else RENAMED.get(dim, dim)
 
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:

@@ -8,6 +8,7 @@ order. Whatever a report needs is stored, so that nothing downstream computes it
 from collections.abc import Callable, Iterable, Iterator
 from types import SimpleNamespace
 from typing import Any
+from unicodedata import is_normalized, normalize
 
 import numpy as np
 import numpy.typing as npt
@@ -410,7 +411,7 @@ LONGEST_NAME = 250  # bytes; netCDF allows 256
 
 def require_free_names(problem: InverseProblem) -> None:
     """Raise :class:`ConfigError` where a parameter or series has the name of another variable, or of a dimension, or
-    one that is too long for a variable.
+    one that is too long for a variable, or that netCDF would spell otherwise: it composes letters and accents (NFC).
     """
     subject = SimpleNamespace(problem=problem, parameters=problem.prior.parameters)
     for path, table in GROUPS.items():
@@ -423,4 +424,8 @@ def require_free_names(problem: InverseProblem) -> None:
                     raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
                 if len(name.encode()) > LONGEST_NAME:
                     raise ConfigError(f"{whose}: {name!r} is too long for a variable of the result")
+                if not is_normalized("NFC", name):
+                    own = item.names[declared.scope]
+                    spelt = f"netCDF spells {own!a} as {normalize('NFC', own)!a}; write it so"
+                    raise ConfigError(f"{whose}: {spelt}")
                 taken |= set() if declared.when.words else {name}

@@ -248,6 +248,12 @@ def test_a_name_that_is_too_long_for_a_variable_is_refused(name):
         fit(lambda p, t: line(p, t), data={"time": TIMES, name: VALUES})
 
 
+@pytest.mark.parametrize("name", ["e\u0301", "\u2126"])  # é of two characters, the sign of the ohm
+def test_a_name_that_a_file_would_spell_otherwise_is_refused(name):
+    with pytest.raises(en4dvar.ConfigError, match=r"parameter .* needs another name: netCDF spells .*; write it so"):
+        fit(lambda p, t: p[name] + 0 * t, priors={name: PRIORS["a"]})
+
+
 def test_names_that_collide_with_each_other_are_refused(tmp_path):
     with pytest.raises(en4dvar.ConfigError, match="'a' needs another name: the result has another 'a_centre'"):
         fit(lambda p, t: p["a"] + p["a_centre"] * t, priors={"a": PRIORS["a"], "a_centre": PRIORS["b"]})
