@@ -78,9 +78,8 @@ def _untold(a: Analysis) -> str:
 def _discrepancy_share(a: Analysis) -> float | None:
     if a.discrepancy is None:
         return None
-    used = a.observations.used
-    residual = (a.observations.values - a.centre_predictions)[used]
-    left = residual - a.discrepancy.mean[used]
+    residual = a.observations.values - a.centre_predictions
+    left = residual - a.discrepancy.mean
     return 1 - float(left @ left) / (float(residual @ residual) or np.nan)
 
 

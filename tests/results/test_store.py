@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from en4dvar.diagnosis.analysis import Discrepancy
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.result import Result, load_result
@@ -83,20 +82,6 @@ def test_scalars_of_the_fit(path, analysis):
     assert stats["converged"] == 1
     assert stats["stop_reason"] == analysis.stop_reason
     assert stats["chi2_per_observation"] == analysis.iterations[-1].chi2_per_observation
-
-
-def test_readings_that_do_not_count_have_no_part_in_what_a_discrepancy_explains(analysis):
-    """One of weight 0 that lies far off."""
-    o, residual = analysis.observations, analysis.observations.values - analysis.centre_predictions
-    off = np.where(np.arange(len(o)) == 4, 9.0, 0.0)
-    observed = replace(o, values=o.values + off, weights=np.where(off > 0, 0.0, o.weights))
-    odd = replace(
-        analysis,
-        problem=replace(analysis.problem, observations=observed),
-        discrepancy=Discrepancy(0.9 * residual, residual, np.zeros((4, 3))),
-    )
-    groups = Result.from_analysis(odd, provenance("")).groups
-    assert groups["/sample_stats"].attrs["discrepancy_share"] == pytest.approx(0.99)
 
 
 def test_summary_is_in_display_units_and_ignores_failed_members(path, analysis):
