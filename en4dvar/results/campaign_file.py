@@ -2,15 +2,17 @@
 
 It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
-the observation times a variable; so is ``G_piece``, where the pieces of a parameter begin that varies at knots of each
-data set. Scalars that judge a fit become variables of ``sample_stats``. The paths between the observations, the
-iterations, the descents and the modes stay in ``datasets.pack``.
+the observation times a variable, as of several series ``y_time`` and ``y_observation``; so is ``G_piece``, where the
+pieces of a parameter begin that varies at knots of each data set. Scalars that judge a fit become variables of
+``sample_stats``. The paths between the observations, the iterations, the descents and the modes stay in
+``datasets.pack``.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,8 +32,10 @@ GROUPS = (
 )  # fmt: skip
 _PATHS = frozenset(f"/{name}" for name in GROUPS)
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
-RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
-PIECE = "_piece"  # ends the dimension, and the coordinate, of the pieces of a parameter that varies
+OWN = (  # dimensions whose coordinates are those of each data set, and what they are called instead
+    (re.compile(r"(^|_)time(?=$|_column$)"), r"\1observation"),
+    (re.compile("_piece$"), "_piece_number"),
+)
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
@@ -52,7 +56,7 @@ class _Layout:
 
     widest: netcdf.Groups = field(default_factory=dict)  # the (first) data set with most parameters
     n_parameters: int = -1
-    n_observations: int = 0
+    sizes: dict[str, dict[str, int]] = field(default_factory=lambda: {group: {} for group in GROUPS})
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
     seen: set[tuple[PackedLayout, tuple[str, ...]]] = field(default_factory=set)
 
@@ -68,7 +72,8 @@ class _Layout:
             self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
         said = dict(zip(sizes, result.attributes, strict=True))
         for name, kinds in self.scalars.items():
-            self.n_observations = max(self.n_observations, sizes[f"/{name}"].get("time", 0))
+            for dim, size in sizes[f"/{name}"].items():
+                self.sizes[name][dim] = max(size, self.sizes[name].get(dim, 0))
             for key, value in said[f"/{name}"].items():
                 kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
 
@@ -155,12 +160,12 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
         group.createDimension("dataset", n_datasets)
         kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
-            group.createDimension(_dimension(dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
+            group.createDimension(dimension(dim), layout.sizes[name][dim])
         about = {"units": "1", "long_name": "data set"}
         netcdf.define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
         for key, variable in kept.items():
-            own = key not in variable.dims or _dimension(key) != key  # of each data set
-            dims = tuple(map(_dimension, variable.dims))
+            own = key not in variable.dims or dimension(key) != key  # of each data set
+            dims = tuple(map(dimension, variable.dims))
             kind, dims = variable.values.dtype, ("dataset", *dims) if own else dims
             made = netcdf.define_variable(group, key, kind, dims, netcdf.attributes_of(variable), missing=own)
             if not own:
@@ -171,9 +176,15 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
             netcdf.define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
 
 
-def _dimension(dim: str) -> str:
-    """What a dimension is called whose coordinate is a variable, for data sets differ in it."""
-    return f"{dim}_number" if dim.endswith(PIECE) else RENAMED.get(dim, dim)
+def dimension(dim: str) -> str:
+    """What a dimension of a data set's result is called here.
+
+    >>> dimension("time"), dimension("y_time"), dimension("mu_piece"), dimension("draw")
+    ('observation', 'y_observation', 'mu_piece_number', 'draw')
+    """
+    for ending, other in OWN:
+        dim = ending.sub(other, dim)
+    return dim
 
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:
