@@ -54,7 +54,7 @@ class DamagedError(OutputError):
 class _Layout:
     """What the file must have room for: the results as a whole, of which one is in memory at a time."""
 
-    widest: netcdf.Groups = field(default_factory=dict)  # the (first) data set with most parameters
+    widest: netcdf.Groups = field(default_factory=dict)  # of the (first) data set with most parameters, or that has it
     n_parameters: int = -1
     sizes: dict[str, dict[str, int]] = field(default_factory=lambda: {group: {} for group in GROUPS})
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
@@ -68,14 +68,21 @@ class _Layout:
             return
         self.seen.add(kind)
         sizes, n_parameters = result.layout.sizes, result.layout.sizes["/sample_stats"][PARAMETER]
-        if n_parameters > self.n_parameters:
-            self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
+        groups, wider = unpacked(content, _PATHS), n_parameters > self.n_parameters
+        first, other = (groups, self.widest) if wider else (self.widest, groups)
+        self.widest = {path: _with(group, other.get(path, netcdf.Group())) for path, group in first.items()}
+        self.n_parameters = max(n_parameters, self.n_parameters)
         said = dict(zip(sizes, result.attributes, strict=True))
         for name, kinds in self.scalars.items():
             for dim, size in sizes[f"/{name}"].items():
                 self.sizes[name][dim] = max(size, self.sizes[name].get(dim, 0))
             for key, value in said[f"/{name}"].items():
                 kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
+
+
+def _with(group: netcdf.Group, other: netcdf.Group) -> netcdf.Group:
+    """A group and what it lacks of another one."""
+    return netcdf.Group({**other.variables, **group.variables}, {**other.coords, **group.coords}, group.attrs)
 
 
 def save_campaign(
