@@ -14,7 +14,7 @@ import numpy as np
 from en4dvar.estimation.design.evaluate import Evaluated
 from en4dvar.estimation.design.nested import THIN, Decision
 from en4dvar.model.state import Array
-from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.hints import counted, free_name
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
@@ -274,8 +274,7 @@ def _cells(designs: Designs) -> list[list[Any]]:
     needed = [f"{name}_needs_{other}_factor" for name in asked.wanted for other in others]
     for row in ranked(designs):
         result = row.evaluated
-        cells = {name: row.settings.get(name, "") for name in asked.knobs}
-        cells |= {"experiments": result.alike, "readings": len(result.readings), "price": row.price}
+        cells: dict[str, Any] = {"experiments": result.alike, "readings": len(result.readings), "price": row.price}
         cells |= {"gain_nats": result.gain, "gain_error": result.error, "method": result.method}
         cells |= {name: getattr(result.decision, field) for field, (name, _) in DECISION.items() if result.decision}
         for name, (unit, shown), std in zip(asked.parameters, asked.units, result.std.tolist(), strict=True):
@@ -283,7 +282,8 @@ def _cells(designs: Designs) -> list[list[Any]]:
         cells |= {f"{name}_std_ratio": float(x) for name, x in zip(asked.parameters, result.ratio, strict=True)}
         cells |= {"lost": result.lost, "beyond_validity": result.beyond}
         cells |= zip(needed, [] if result.needed is None else result.needed.ravel().tolist(), strict=True)
-        rows.append(cells)
+        taken = {name: free_name(name, cells.keys() | ({*asked.knobs} - {name})) for name in asked.knobs}
+        rows.append({column: row.settings.get(name, "") for name, column in taken.items()} | cells)
     return [[*rows[0]], *([*cells.values()] for cells in rows)]
 
 

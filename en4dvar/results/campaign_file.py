@@ -2,14 +2,17 @@
 
 It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
-the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
-observations, the iterations, the descents and the modes stay in ``datasets.pack``.
+the observation times a variable, as of several series ``y_time`` and ``y_observation``; so is ``G_piece``, where the
+pieces of a parameter begin that varies at knots of each data set. Scalars that judge a fit become variables of
+``sample_stats``. The paths between the observations, the iterations, the descents and the modes stay in
+``datasets.pack``.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +32,10 @@ GROUPS = (
 )  # fmt: skip
 _PATHS = frozenset(f"/{name}" for name in GROUPS)
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
-RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
+OWN = (  # dimensions whose coordinates are those of each data set, and what they are called instead
+    (re.compile(r"(^|_)time(?=$|_column$)"), r"\1observation"),
+    (re.compile("_piece$"), "_piece_number"),
+)
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
@@ -48,9 +54,9 @@ class DamagedError(OutputError):
 class _Layout:
     """What the file must have room for: the results as a whole, of which one is in memory at a time."""
 
-    widest: netcdf.Groups = field(default_factory=dict)  # the (first) data set with most parameters
+    widest: netcdf.Groups = field(default_factory=dict)  # of the (first) data set with most parameters, or that has it
     n_parameters: int = -1
-    n_observations: int = 0
+    sizes: dict[str, dict[str, int]] = field(default_factory=lambda: {group: {} for group in GROUPS})
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
     seen: set[tuple[PackedLayout, tuple[str, ...]]] = field(default_factory=set)
 
@@ -62,13 +68,21 @@ class _Layout:
             return
         self.seen.add(kind)
         sizes, n_parameters = result.layout.sizes, result.layout.sizes["/sample_stats"][PARAMETER]
-        if n_parameters > self.n_parameters:
-            self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
+        groups, wider = unpacked(content, _PATHS), n_parameters > self.n_parameters
+        first, other = (groups, self.widest) if wider else (self.widest, groups)
+        self.widest = {path: _with(group, other.get(path, netcdf.Group())) for path, group in first.items()}
+        self.n_parameters = max(n_parameters, self.n_parameters)
         said = dict(zip(sizes, result.attributes, strict=True))
         for name, kinds in self.scalars.items():
-            self.n_observations = max(self.n_observations, sizes[f"/{name}"].get("time", 0))
+            for dim, size in sizes[f"/{name}"].items():
+                self.sizes[name][dim] = max(size, self.sizes[name].get(dim, 0))
             for key, value in said[f"/{name}"].items():
                 kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
+
+
+def _with(group: netcdf.Group, other: netcdf.Group) -> netcdf.Group:
+    """A group and what it lacks of another one."""
+    return netcdf.Group({**other.variables, **group.variables}, {**other.coords, **group.coords}, group.attrs)
 
 
 def save_campaign(
@@ -153,12 +167,12 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
         group.createDimension("dataset", n_datasets)
         kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
-            group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
+            group.createDimension(dimension(dim), layout.sizes[name][dim])
         about = {"units": "1", "long_name": "data set"}
         netcdf.define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
         for key, variable in kept.items():
-            own = key not in variable.dims or key == "time"  # of each data set
-            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
+            own = key not in variable.dims or dimension(key) != key  # of each data set
+            dims = tuple(map(dimension, variable.dims))
             kind, dims = variable.values.dtype, ("dataset", *dims) if own else dims
             made = netcdf.define_variable(group, key, kind, dims, netcdf.attributes_of(variable), missing=own)
             if not own:
@@ -167,6 +181,17 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
             netcdf.define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
+
+
+def dimension(dim: str) -> str:
+    """What a dimension of a data set's result is called here.
+
+    >>> dimension("time"), dimension("y_time"), dimension("mu_piece"), dimension("draw")
+    ('observation', 'y_observation', 'mu_piece_number', 'draw')
+    """
+    for ending, other in OWN:
+        dim = ending.sub(other, dim)
+    return dim
 
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:

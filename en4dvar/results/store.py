@@ -34,7 +34,7 @@ from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
-from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL, SCOPES
+from en4dvar.results.variables import BESIDE, COORDINATES, GROUPS, OPTIONAL, SCOPES
 
 NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
 COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
@@ -237,22 +237,16 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
 
 # The check of what is read
 
-BESIDE: Mapping[str, str] = {
-    "observed_data": "observation_errors",
-    "prior_predictive": "prior_paths",
-    "posterior_predictive": "posterior_paths",
-}
-
 
 def joined(groups: Groups, path: str) -> Group:
     """A group with the variables of the one beside it; files of earlier versions have all in one."""
-    group, beside = groups[path], groups.get(f"/{BESIDE.get(path[1:])}")
+    group, beside = groups[path], groups.get(BESIDE.get(path, ""))
     if beside is None:
         return group
     return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)
 
 
-_OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
+_OPTIONAL = OPTIONAL | {*BESIDE.values()}
 
 
 def of_members(group: Group) -> dict[str, Variable]:
@@ -295,7 +289,7 @@ def _declared(
         "fixed": [{"fixed": name} for name in fixed],
         **dict.fromkeys(("series", "shared", "time"), series),
     }
-    tables = {path: (*table, *GROUPS.get(f"/{BESIDE.get(path[1:])}", ())) for path, table in GROUPS.items()}
+    tables = {path: (*table, *GROUPS.get(BESIDE.get(path, ""), ())) for path, table in GROUPS.items()}
     tables["coordinates"] = COORDINATES
     return {
         path: {d.name.format(**of_item): d for d in table for of_item in names.get(d.scope, ())}

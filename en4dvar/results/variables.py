@@ -8,6 +8,7 @@ order. Whatever a report needs is stored, so that nothing downstream computes it
 from collections.abc import Callable, Iterable, Iterator
 from types import SimpleNamespace
 from typing import Any
+from unicodedata import is_normalized, normalize
 
 import numpy as np
 import numpy.typing as npt
@@ -404,23 +405,36 @@ GROUPS: dict[str, Table] = {
 }
 OPTIONAL = frozenset({"/fields", "/withheld", "/posterior_draws"})
 """Groups that a file may lack."""
-NAMED = ("parameter", "series")  # placeholders that stand for names of a user's
+BESIDE = {
+    "/observed_data": "/observation_errors",
+    "/prior_predictive": "/prior_paths",
+    "/posterior_predictive": "/posterior_paths",
+}
+"""Group → the one that is read together with it."""
+NAMED = ("parameter", "series", "shared")  # placeholders that stand for names of a user's
 LONGEST_NAME = 250  # bytes; netCDF allows 256
 
 
 def require_free_names(problem: InverseProblem) -> None:
     """Raise :class:`ConfigError` where a parameter or series has the name of another variable, or of a dimension, or
-    one that is too long for a variable.
+    one that is too long for a variable, or that netCDF would spell otherwise: it composes letters and accents (NFC).
     """
     subject = SimpleNamespace(problem=problem, parameters=problem.prior.parameters)
-    for path, table in GROUPS.items():
-        taken = {name for d in table for name in (d.name, *d.dims.split()) if "{" not in name}
-        for declared in table:
-            for item in SCOPES[declared.scope](subject) if declared.scope in NAMED else ():
-                name = declared.name.format(**item.names)
-                whose = f"the {declared.scope} {item.names[declared.scope]!r} needs another name"
-                if name in taken:
-                    raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
-                if len(name.encode()) > LONGEST_NAME:
-                    raise ConfigError(f"{whose}: {name!r} is too long for a variable of the result")
-                taken |= set() if declared.when.words else {name}
+    for path, own_table in GROUPS.items():
+        table = (*own_table, *GROUPS.get(BESIDE.get(path, ""), ()))
+        named = [(d, item) for d in table if d.scope in NAMED for item in SCOPES[d.scope](subject)]
+        dims = [dim for d, item in named for dim in d.dims.format(**item.names).split()]
+        taken = {"dataset", *dims}  # the first: of the file of a campaign
+        taken |= {name for d in table for name in (d.name, *d.dims.split()) if "{" not in name}
+        for declared, item in named:
+            name = declared.name.format(**item.names)
+            kind, own = ("parameter" if "parameter" in item.names else "series"), next(iter(item.names.values()))
+            whose = f"the {kind} {own!r} needs another name"
+            if name in taken:
+                raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
+            if len(name.encode()) > LONGEST_NAME:
+                raise ConfigError(f"{whose}: {name!r} is too long for a variable of the result")
+            if not is_normalized("NFC", name):
+                spelt = f"netCDF spells {own!a} as {normalize('NFC', own)!a}; write it so"
+                raise ConfigError(f"{whose}: {spelt}")
+            taken |= set() if declared.when.words else {name}

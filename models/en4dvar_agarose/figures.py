@@ -35,7 +35,7 @@ def all_figures(study: Study) -> Iterator[Captioned]:
         yield f"distributions_{route}", caption, distributions(study, route)
         yield f"nrmse_{route}", f"Distributions of NRMSE for the models; {words}.", nrmse_figure(study, route)
     for fit in (fit for fit in study.every_fit if fit.model == "qlkv"):
-        members = len(fit.members("mu"))
+        members = len(fit.members(fit.prior.names[0]))
         caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
         yield f"members_{named(fit.gel)}", caption, combined(study, fit)
         caption = (
@@ -169,13 +169,13 @@ def nrmse_figure(study: Study, route: Route) -> Chart:
 def combined(study: Study, fit: Fit) -> Chart:
     """Histograms of all posterior members with prior, mean and (twin) the truths."""
     panels: list[Panel] = []
-    for q in R0_FIRST:
+    for q in (q for q in R0_FIRST if fit.estimated(q.name)):
         values, prior = fit.members(q.name) * q.factor, fit.prior_members(q.name) * q.factor
         low, high = map(float, np.quantile(values, (0.001, 0.999)))
         edges = np.linspace(low, high, 31)
         panel = Panel(_label(q), yticks=(), left=False, legend=not panels)
-        panel.stairs(edges, np.histogram(values, edges, density=True)[0], "posterior", 0.75, label="members")
-        panel.stairs(edges[::3], np.histogram(prior, edges[::3], density=True)[0], "prior", 0.0, 1.0, label="prior")
+        panel.stairs(edges, _heights(values, edges), "posterior", 0.75, label="members")
+        panel.stairs(edges[::3], _heights(prior, edges[::3]), "prior", 0.0, 1.0, label="prior")
         top = panel.limits()[1][1]
         panel.line(np.full(2, values.mean()), [0, top], "ink", 1.0, label="mean")
         truth = study.true_values(fit.gel, q.name) * q.factor
@@ -186,10 +186,15 @@ def combined(study: Study, fit: Fit) -> Chart:
     return in_columns(panels, 0.43 * COLUMN, width=COLUMN)
 
 
+def _heights(values: Array, edges: Array) -> Array:
+    """Density of values between the edges; where some lie beyond these the area is less than one."""
+    return np.histogram(values, edges)[0] / (len(values) * np.diff(edges))
+
+
 def iterations(fit: Fit) -> Chart:
     """Estimates of every data set against the iteration, from the prior mean on."""
     panels = []
-    for q in R0_FIRST:
+    for q in (q for q in R0_FIRST if fit.estimated(q.name)):
         j = fit.prior.names.index(q.name)
         guess = float(np.exp(fit.prior.mean[j])) * q.factor
         panel = Panel("iteration", _label(q), whole=True)
@@ -207,9 +212,12 @@ def population(study: Study) -> Chart:
     gels = list(study.populations)
     panels: list[Panel] = []
     for q in QUANTITIES:
+        of_gels = [(row, *gel) for row, gel in enumerate(study.populations.items()) if q.name in gel[1].names]
+        if not of_gels:
+            continue
         panel = Panel(_label(q), x_logarithmic=True, legend=not panels, ylim=(-0.6, len(gels) - 0.4))
         panel.yticks, panel.y_names = range(len(gels)), gels if not panels else [""] * len(gels)
-        for row, (gel, distribution) in enumerate(study.populations.items()):
+        for row, gel, distribution in of_gels:
             j, fit = distribution.names.index(q.name), study.fits[gel]["qlkv"]
             low, middle, high = np.quantile(distribution.posterior.mean[:, j], LEVELS) * q.factor
             panel.intervals([low], [high], [row], "posterior", 1.5)

@@ -108,17 +108,17 @@ def _narrow(study: Study) -> Cells:
 
 
 def _coverage(study: Study) -> list[list[str]]:
-    return [
-        [gel, *(f"{100 * study.coverage(gel, 'qlkv', q.name):.0f} %" for q in QUANTITIES)]
-        for gel in study.fits
-        if study.truth and "qlkv" in study.fits[gel]
-    ]
+    def share(fit: Fit, name: str) -> str:
+        return f"{100 * study.coverage(fit.gel, fit.model, name):.0f} %" if fit.estimated(name) else "–"
+
+    general = [fit for fit in study.every_fit if study.truth and fit.model == "qlkv"]
+    return [[fit.gel, *(share(fit, q.name) for q in QUANTITIES)] for fit in general]
 
 
 def _population(study: Study) -> Cells:
     for gel, distribution in study.populations.items():
         fit = study.fits[gel]["qlkv"]
-        for q in QUANTITIES:
+        for q in (q for q in QUANTITIES if q.name in distribution.names):
             j = distribution.names.index(q.name)
             stacked, truth = fit.members(q.name) * q.factor, study.true_values(gel, q.name) * q.factor
             low, mean, high = np.quantile(distribution.posterior.mean[:, j], LEVELS) * q.factor

@@ -10,6 +10,7 @@ import subprocess
 import time
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,13 +19,16 @@ from click.testing import CliRunner
 from run_files import assert_same_results, command, environment, resumed_until_done, run_cli
 
 from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar_agarose import report, tables
 from en4dvar_agarose.commands import study as study_command
-from en4dvar_agarose.figures import all_figures, collapse
-from en4dvar_agarose.fits import OneGel, probability, verdict
+from en4dvar_agarose.figures import all_figures, collapse, combined, iterations, population
+from en4dvar_agarose.fits import Fit, OneGel, Study, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
+from en4dvar_bubble.dynamics import R0
+from en4dvar_bubble.laws.parameters import MU, G
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GELS = ("0.3 %", "1 %")
@@ -255,6 +259,27 @@ def test_gels_whose_files_would_have_one_name_are_refused(tmp_path):
         load_study(tmp_path / "s.yaml")
     told = [line for line in str(caught.value).splitlines() if "would have the names of those of 'Gel +'" in line]
     assert ["s.yaml:5:3" in told[0], "s.yaml:6:3" in told[1], len(told)] == [True, True, 2]
+
+
+def test_a_parameter_that_is_held_fixed_has_no_panel_and_no_interval():
+    """What needs none of it: figures of members, of iterations and of the population, rows of the page."""
+    rng, terms = np.random.default_rng(1), [PriorTerm.lognormal(p, 1.0, 0.5) for p in (G, MU, R0)]
+    prior, posterior = np.exp(0.5 * rng.standard_normal((2000, 3))), np.exp(0.1 * rng.standard_normal((2000, 3)))
+    steps = [SimpleNamespace(centre=np.ones(3))]
+    analysis = SimpleNamespace(name="a", prior=prior, posterior=posterior, iterations=steps)
+    of_a = SimpleNamespace(prior=Prior(terms), fixed={"alpha": 0.03}, observations=SimpleNamespace(name="a"))
+    fit = Fit("1 %", "qlkv", (of_a,), None, (analysis,))
+    draws = SimpleNamespace(mean=posterior, between=posterior)
+    populations = {"1 %": SimpleNamespace(names=("G", "mu", "R0"), posterior=draws)}
+    truth = {"a": {"G": 1.0, "alpha": 0.03, "mu": 1.0, "R0": 9.0}}
+    told = Study(None, {"1 %": {"qlkv": fit}}, populations, {}, truth)
+    for chart in (iterations(fit), population(told)):
+        assert sum(bool(p.marks) for row in chart.rows for p in row.panels) == 3
+    assert report._coverage(told) == [["1 %", "100 %", "–", "100 %", "0 %"]]
+    assert [row[1].split()[0] for row in report._population(told)] == ["G", "μ", "R₀"]
+    (panel,) = (p for row in combined(told, fit).rows for p in row.panels if p.xlabel.startswith(r"$\mu$"))
+    members, before = (mark.y.max() for mark in panel.marks[1:3])
+    assert before == pytest.approx(members / 5, rel=0.3)  # densities of the same numbers, five times as wide
 
 
 def test_collapse_of_a_known_history():

@@ -301,6 +301,13 @@ def test_what_is_taken_to_the_lab(tmp_path):
     assert f"3, at {taken} s" in (directory / "design.html").read_text()
 
 
+def test_a_knob_that_is_called_as_a_column_of_the_table_has_one_of_its_own(tmp_path):
+    knobs = {"price": {"key": "design.price.reading", "values": [2]}}
+    _, directory = run_design(_plan(knobs=knobs, method="linear"), out=tmp_path / "out", overrides=PAGE)
+    rows = list(csv.DictReader((directory / "designs.csv").read_text().splitlines()))
+    assert {(row["price_2"], row["price"]) for row in rows} == {("", "7.0"), ("2", "14.0")}
+
+
 def test_units_of_knobs_on_the_page_are_as_of_all_figures(tmp_path):
     """An axis said "every [us]"."""
     every = {"key": "design.times.step", "values": ["400000 us", "800000 us"]}

@@ -10,6 +10,8 @@ import pytest
 from toys import Vectorised, make_observations
 
 from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series
 from en4dvar.estimation.design.evaluate import choose
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.plumbing.errors import ConfigError
@@ -64,6 +66,18 @@ def test_readings_of_weight_zero_are_none_to_choose_from():
     np.testing.assert_array_equal(choose(planned, planned.draws(30, 1), 4), best)
     with pytest.raises(ConfigError, match="no 5 of 4 readings"):
         choose(planned, planned.draws(30, 1), 5)
+
+
+def test_readings_of_several_series_lie_apart_in_time_whatever_their_order():
+    """Those at 0.4, 1.6, 9.4 and 10.6, though the series that stands first lies between them."""
+    planned, times = _planned(), [np.array([1.0, 10.0]), np.array([0.4, 1.6, 9.4, 10.6])]
+    (observable,) = planned.problem.model.observables
+    series = [
+        Series(observable, own, 0 * own, noise_of(0.3 + 0 * own, 0 * own), name=name)
+        for name, own in zip("uv", times, strict=True)
+    ]
+    planned = Planned(replace(planned.problem, observations=Observations.of_series(series)))
+    assert choose(planned, planned.draws(30, 1), 4, 1.0).tolist() == [2, 3, 4, 5]
 
 
 def test_choices_that_are_not_possible():

@@ -255,6 +255,9 @@ def test_one_observation_is_enough_and_bounds_hold(rich):
         ("2.0 0.5 10.0 pg -1.0 10.0 1", "2.0 0.5 10.0 pg -1.0 10.0 2", "hk:1-a has a model command of its own"),
         ("++par", "++parcov(prior.cov) par", "option parcov: "),
         ("++par", "++ies_par_en(prior.jcb) par", "prior.jcb: no such file"),
+        ("++par", "++ies_parameter_csv(prior.csv) par", "prior.csv: no such file"),
+        ("++par", "++ies_obs_csv(noise.csv) par", "noise.csv: no such file"),
+        ("++par", "++ies_obs_restart_csv(r.csv) par", "option ies_obs_restart_csv: an estimate begins at its prior"),
         ("++par", "++ies_no_noise(true) par", "option ies_no_noise: errors are drawn here"),
         ("++par", "++obscov(noise.cov) par", "option obscov"),
         (

@@ -40,6 +40,9 @@ def test_each_space_holds_its_parameter_in_its_width():
         (123, 3, "123"),
         (math.inf, 5, "inf"),
         (1 / 3, 3, "0.3"),
+        (0.00011723961, 6, "1.2e-4"),
+        (-0.000735887, 8, "-7.36e-4"),
+        (-0.0005, 6, "-5.e-4"),
     ],
 )
 def test_a_number_keeps_as_many_digits_as_fit(value, width, text):

@@ -142,6 +142,13 @@ def test_a_value_that_is_missing_is_lost_alone(way, folder):
     np.testing.assert_array_equal(path["y"], expected)
 
 
+def test_a_first_line_that_lacks_a_value_is_no_line_of_names(folder):
+    outputs = {"y": {"file": "stdout", "column": 2}}
+    words = {"command": "printf '%s\\n' '1 ******' '2 {a}'", "templates": (), "outputs": outputs}
+    (path,) = model_of(folder, **words).trajectories(np.array([[0.5, 1.0]]), TIMES[:2])
+    np.testing.assert_array_equal(path["y"], [np.nan, 0.5])
+
+
 @pytest.mark.slow
 def test_members_that_lack_a_value_leave_a_linear_posterior_as_it_is(folder, monkeypatch):
     """Some quarter of them, at random; the reading is regressed on the others."""

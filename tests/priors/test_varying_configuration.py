@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -220,6 +221,20 @@ def test_pieces_in_the_file(finished):
     assert np.all(np.diff(walk.posterior, axis=0) > 0)
     assert result.sample_stats.attrs["log_evidence_change"] > 3
     assert "Stiffness: the data speak for a change" in render_set(result, [])
+
+
+def test_pieces_of_each_data_set_of_a_campaign_begin_at_knots_of_its_own(tmp_path):
+    """The highest readings of two oscillations, 200 ms and 165 ms from their beginnings."""
+    path = varying(tmp_path, "{at: maxima, std: 40 %}", data=csv_text(61))
+    (tmp_path / "toy_2.csv").write_text(csv_text(61, k=3.0))
+    few = {"members": 4, "max_iterations": 1, "what_if": False, "refine": "none"}
+    few = {f"assimilation.{key}": value for key, value in few.items()} | {"output.report": False}
+    run_campaign(load_config(path, {**few, "data.path": "toy*.csv", "output.directory": str(tmp_path / "out")}))
+    with netCDF4.Dataset(tmp_path / "out" / "posterior.nc") as file:
+        file.set_auto_mask(False)
+        posterior = file["posterior"]
+        assert posterior["k_piece"][:] == pytest.approx(np.array([[0.0, 0.2], [0.0, 0.165]]))
+        assert posterior["k_pieces"].dimensions == ("dataset", "chain", "draw", "k_piece_number")
 
 
 def test_pieces_of_what_is_not_to_be_trusted_have_no_interval(finished):

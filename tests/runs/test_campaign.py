@@ -3,6 +3,7 @@
 import csv
 import shutil
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,6 +12,7 @@ from toy_config import csv_text
 
 from en4dvar.commands.common import Failed
 from en4dvar.commands.run import _tell
+from en4dvar.config import load_config
 from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.results.campaign_file import GROUPS, save_campaign
@@ -50,6 +52,40 @@ def test_failures_are_named_and_the_rest_is_estimated(campaign):
         assert [r["failure"] for r in rows if r["dataset"] == outcome.name] == [outcome.failure]
     assert {r["dataset"]: r["name"] for r in rows if not r["failure"]} == dict.fromkeys(["set0", "set1", "set3"], "k")
     assert [p.name for p in results_of(campaign.directory / PACK)] == ["set0", "set1", "set3"]
+
+
+def test_several_series_of_different_length_lie_side_by_side_with_their_times(tmp_path):
+    """Two cameras; what the second one saw of the second oscillation is longer than what either saw of the first."""
+    columns = {"time": {"name": "t_ms", "unit": "ms"}, "position": {"name": "x_um", "unit": "um"}}
+    of_all = {"observable": "position", "columns": columns, "error": {"position_std": "2 um"}}
+    lengths = {"left": (9, 7), "right": (8, 11)}
+    for camera, counts in lengths.items():
+        (tmp_path / camera).mkdir()
+        for name, count in zip("ab", counts, strict=True):
+            (tmp_path / camera / f"{name}.csv").write_text(csv_text(count))
+    asked = {
+        "name": "two",
+        "data": {"series": {camera: {**of_all, "path": str(tmp_path / camera)} for camera in lengths}},
+        "model": {"name": "toy_models:Oscillator", "mass": "2 g"},
+        "parameters": {
+            "A": "100 um",
+            "c": "0.02 N s/m",
+            "k": {"prior": "lognormal", "median": "3 N/m", "log_std": 0.3},
+        },
+        "assimilation": {"members": 3, "max_iterations": 1, "what_if": False, "refine": "none"},
+        "output": {"report": False, "directory": str(tmp_path / "run")},
+    }
+    assert run_campaign(load_config(asked)).exit_code == 0
+    with netCDF4.Dataset(tmp_path / "run" / "posterior.nc") as file:
+        file.set_auto_mask(False)
+        observed, predicted = file["observed_data"], file["posterior_predictive"]
+        assert predicted["right"].dimensions == ("dataset", "chain", "draw", "right_observation")
+        for camera, counts in lengths.items():
+            times = [
+                np.where(np.arange(max(counts)) < count, 5e-3 * np.arange(max(counts)), np.nan) for count in counts
+            ]
+            np.testing.assert_allclose(observed[f"{camera}_time"][:], times)
+            np.testing.assert_array_equal(np.isnan(observed[camera][:]), np.isnan(times))
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,9 @@ def test_what_is_wrong_with_a_function_is_told(function, reason):
     assert reason in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["chain", "draw", "posterior_draw", "iteration", "J", "J_background", "dfs"])
+@pytest.mark.parametrize(
+    "name", ["chain", "dataset", "draw", "posterior_draw", "iteration", "J", "J_background", "dfs"]
+)
 def test_a_name_that_the_result_has_itself_is_refused_before_anything_is_computed(name):
     runs = []
 
@@ -246,6 +248,22 @@ def test_a_name_that_is_too_long_for_a_variable_is_refused(name):
         fit(lambda p, t: p[name] + 0 * t, priors={name: PRIORS["a"]})
     with pytest.raises(en4dvar.ConfigError, match="is too long for a variable of the result"):
         fit(lambda p, t: line(p, t), data={"time": TIMES, name: VALUES})
+
+
+@pytest.mark.parametrize("names", [("y", "y_std"), ("y", "y_weights"), ("y", "y_path"), ("y", "y_time"), ("weights",)])
+def test_a_series_that_is_called_as_what_is_read_together_with_it_is_refused(names):
+    """Its readings would be taken for errors, weights or times, or those for its readings."""
+    data = {name: {"time": TIMES, name: VALUES} for name in names}
+    single = {"data": data[names[0]], "error": 0.1}
+    asked = {"data": data, "error": dict.fromkeys(names, 0.1)} if len(names) > 1 else single
+    with pytest.raises(en4dvar.ConfigError, match=f"needs another name: the result has another '{names[-1]}'"):
+        fit(lambda p, t: dict.fromkeys(names, line(p, t)), **asked)
+
+
+@pytest.mark.parametrize("name", ["e\u0301", "\u2126"])  # é of two characters, the sign of the ohm
+def test_a_name_that_a_file_would_spell_otherwise_is_refused(name):
+    with pytest.raises(en4dvar.ConfigError, match=r"parameter .* needs another name: netCDF spells .*; write it so"):
+        fit(lambda p, t: p[name] + 0 * t, priors={name: PRIORS["a"]})
 
 
 def test_names_that_collide_with_each_other_are_refused(tmp_path):

@@ -264,6 +264,7 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
     require_alive(len(tangents.at), len(u))
     _, rows = tangents.whitened(planned)
     counted = np.flatnonzero(observations.weights)
+    counted = counted[np.argsort(observations.times[counted], kind="stable")]  # those of several series, too
     search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2])[:, :, counted], planned.asked)
     times = observations.times[counted]
     near = np.abs(np.subtract.outer(times, times)) < apart * (1 - 1e-9)
@@ -289,7 +290,7 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
             search.add(chosen[place], 1)
         if not moved:
             break
-    return counted[np.sort(np.array(chosen, dtype=np.intp))]
+    return np.sort(counted[np.array(chosen, dtype=np.intp)])
 
 
 class _Search:

@@ -30,7 +30,7 @@ RANGES = {"at_most": "less_than", "at_least": "greater_than"}  # columns of exte
 _WHY_NOT = {  # reason → options of PEST++, or how several begin
     "errors are drawn here, from the weights": "ies_no_noise da_obs",
     "weights are those of the control file": "ies_phi_factor",
-    "an estimate begins at its prior here": "ies_restart da_restart",
+    "an estimate begins at its prior here": "ies_restart da_restart ies_obs_restart ies_observation_restart",
     "there is one weight an observation here": "ies_weight da_weight",
     "name a localisation in assimilation= instead": "ies_loc ies_autoadaloc",
     "the prior alone regularises here": "ies_reg_factor",
@@ -51,8 +51,8 @@ COLUMNS: Mapping[str, str] = {  # of external tables
 OFF = ("", "0", "false", "no")
 PARCOV = ("parcov", "parameter_covariance", "parcov_filename")
 OBSCOV = ("obscov", "observation_covariance", "obscov_filename")
-PRIOR_DRAWS = ("ies_par_en", "ies_parameter_ensemble")
-ERROR_DRAWS = ("ies_obs_en", "ies_observation_ensemble")
+PRIOR_DRAWS = ("ies_par_en", "ies_parameter_ensemble", "ies_par_csv", "ies_parameter_csv")  # the last two: earlier
+ERROR_DRAWS = ("ies_obs_en", "ies_observation_ensemble", "ies_obs_csv", "ies_observation_csv")
 READ = (*PARCOV, *OBSCOV, *PRIOR_DRAWS, *ERROR_DRAWS)
 CHANCE = 6.0  # standard errors that draws may lie off
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[edED][+-]?\d+)?"

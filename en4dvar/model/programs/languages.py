@@ -87,10 +87,10 @@ def fitted(value: float, width: int) -> str:
 
     It has a decimal point wherever one fits, for Fortran reads digits without one as decimals: 1e-05 as 1e-08 by E10.3.
 
-    >>> fitted(0.1, 20), fitted(1e-5, 20), fitted(2 / 3, 8), fitted(-123456.789, 7)
-    ('0.1', '1.0e-05', '0.666667', '-1.23e5')
+    >>> fitted(0.1, 20), fitted(1e-5, 20), fitted(2 / 3, 8), fitted(-123456.789, 7), fitted(0.00012345, 6)
+    ('0.1', '1.0e-05', '0.666667', '-1.23e5', '1.2e-4')
     """
-    shorter = [f"{value:.{digits}g}" for digits in range(17, 0, -1)]
+    shorter = [form for digits in range(17, 0, -1) for form in (f"{value:.{digits}g}", f"{value:.{digits - 1}e}")]
     for points in ((".0", "."), ("",)):
         for text in (repr(float(value)), *shorter):
             mantissa, e, exponent = text.partition("e")

@@ -93,8 +93,8 @@ def _column(text: str, column: str | int | None, file: str) -> Array:
     delimiter = max((",", ";", "\t"), key=lines[0].count)
     rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter in lines[0] else [line.split() for line in lines]
     header = [cell.strip() for cell in rows[0]]
-    if isinstance(column, int):
-        at, first = column - 1, 0 if is_number(languages.plain(header[min(column, len(header)) - 1])) else 1
+    if isinstance(column, int):  # a line of names has no number
+        at, first = column - 1, 0 if any(is_number(languages.plain(cell)) for cell in header) else 1
     elif column in header:
         at, first = header.index(column), 1
     else:
