@@ -90,9 +90,12 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     @property
     def validity(self) -> tuple[ValidityLimit, ...]:  # type: ignore[override]
-        """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
+        """The largest Mach number of the wall that the radial equation can bear, and where that is said; and that the
+        grid holds the layer of gas which condensing vapour leaves at the wall.
+        """
         value, source = MACH_LIMITS[self.radial]
-        return (ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source),)
+        mach = ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source)
+        return (mach, SMEARING) if self.vapour == "transport" else (mach,)
 
     @property
     def path_parameters(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -207,6 +210,13 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return paths
 
 
+SMEARING = ValidityLimit(
+    "smeared",
+    0.0,
+    label="what the layer of gas at the wall is smeared over, in radii, as the grid cannot hold it (model.nodes; docs/"
+    "solver.md)",
+    source="docs/solver.md",
+)
 PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
 NO_STIFFENING, STIFFENED = {ALPHA.name: 0.0}, 0.1
 NEARBY = Wall(3.0, relative=True), "three times R_max"
