@@ -22,6 +22,7 @@ from diagnosis.provoked import (
     run,
     turned,
     waved,
+    waving,
 )
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
@@ -176,6 +177,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "readings-missing": linear,  # a model that gives them
     "residual-structure": lambda: make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05),  # a model with the wave
     "at-bound": in_bounds,
+    "other-assumption": lambda: waving(0.6),
     "upper-limit": lambda: near_zero(1.0),  # a larger value, or better readings
     "several-modes": positive,
     "discrepancy-found": lambda: with_discrepancy(  # a model that has the wave
@@ -229,6 +231,13 @@ def test_an_error_in_the_wrong_unit_is_told_as_such():
     assert "unit" not in " ".join(c.advice for c in again.cautions)
     in_mm = run(replace(problem, observations=replace(problem.observations, error_unit="mm")))
     assert "check the unit of data.error: 5e+05 mm is stated" in told(in_mm, "overstated-error").advice
+
+
+def test_an_assumption_for_which_the_readings_speak_is_told_with_the_option_that_makes_it():
+    c = told(run(waving()), "other-assumption")
+    assert re.match(r"the readings speak for another assumption: J would be lower by \d+ if there were a wave", c.words)
+    assert c.advice == "run with --set model.height='0.6 m', and compare both (en4dvar compare)"
+    assert told(run(waving(0.6)), "other-assumption") is None
 
 
 class Late(Vectorised):
