@@ -12,6 +12,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import DECISIVE, SHORT_STEP, UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
+from en4dvar.diagnosis.honesty.widening import enough
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.caution import Caution, caution, of_several_modes, untrusted, worst_first
@@ -72,7 +73,7 @@ def examine(
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
         *other_assumptions(a),
-        *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing) if whole else ()),
+        *(conflict(a, control, alive) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
@@ -132,6 +133,13 @@ def _validity(a: Analysis, alive: Mask) -> checks.Findings:
         which, leverage = residuals.which, residuals.leverage
     if limits:
         yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
+
+
+def conflict(a: Analysis, control: ControlEnsembles, alive: Mask) -> checks.Findings:
+    """Of the minimum and the prior."""
+    timed = a.observations.noise.timed and not a.timing
+    prior, centre = a.problem.prior, control.centre
+    return checks.conflict(prior, centre, timed, enough(prior, centre, control.posterior[alive]))
 
 
 def other_assumptions(analysis: Analysis) -> checks.Findings:
