@@ -24,7 +24,7 @@ import numpy as np
 
 from en4dvar import calibrate
 from en4dvar.model.state import Array
-from en4dvar_bubble.starter.proposal import MODEL, SIMPLER
+from en4dvar_bubble.starter.physics import MODEL, SIMPLER
 
 Settings = dict[str, Any]
 QUICKSTART = Path(__file__).parents[1] / "configs" / "quickstart.yaml"

@@ -28,7 +28,7 @@ from measured_page import GROUPS, after, chi2, intervals
 from recordings import commit, verbatim
 from records import Record, fill, load
 
-from en4dvar_bubble.starter.proposal import SIMPLER
+from en4dvar_bubble.starter.physics import SIMPLER
 
 COMMIT = commit()  # when this began
 Settings = dict[str, Any]

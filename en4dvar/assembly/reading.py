@@ -14,7 +14,7 @@ from typing import cast
 
 import numpy as np
 
-from en4dvar.config.data import Data, DataPlan, SeriesPlan
+from en4dvar.config.data import Data, DataPlan, SeriesPlan, TimeZero, ZeroOfFile
 from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import DecayingErrors, Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
@@ -22,7 +22,7 @@ from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.formats import SUFFIXES, TRUTHS
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
-from en4dvar.inputs.readers import Rows, read_series
+from en4dvar.inputs.readers import Readings, Rows, read_series, scalar_of
 from en4dvar.inputs.window import vertex
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
@@ -148,8 +148,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     asked = data.window
     window = read.window(asked.start, asked.end, asked.prominence)
     times, values = read.times[window], read.values[window]
-    top = vertex(read.times, read.values) if data.time_zero == "top" else 0.0
-    zero = float({"file": 0.0, "window": times[0], "top": top}.get(str(data.time_zero), data.time_zero))
+    zero = _zero_of(data.time_zero, read, times[0], path)
     times = times - zero
     if times[0] < 0:
         clock = data.columns.time
@@ -193,6 +192,15 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     except (ValueError, DataError) as error:
         words = str(error)
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
+
+
+def _zero_of(asked: TimeZero | float | ZeroOfFile, read: Readings, first: float, path: Path) -> float:
+    """Where the model's clock starts on that of the file, of which the ``first`` reading is used."""
+    if isinstance(asked, ZeroOfFile):
+        return scalar_of(asked.scalar, read.scalars, path, "data.time_zero") + asked.plus
+    if asked == "top":
+        return vertex(read.times, read.values)
+    return {"file": 0.0, "window": first}[asked] if isinstance(asked, str) else asked
 
 
 def step_of(times: Array) -> float:

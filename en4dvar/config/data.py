@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
-from en4dvar.config.context import PLACEHOLDER, Context, Faults, Made, OfObservable, Place
+from en4dvar.config.context import PLACEHOLDER, TEXT, Context, Faults, Made, OfObservable, Place
 from en4dvar.config.of_readings import BOUNDS, PLACES, WEIGHTS, Error, Placing, Weighing
 from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
@@ -143,11 +143,36 @@ class WindowSection(Section):
 TimeZero = Literal["file", "window", "top"]
 
 
-def read_time_zero(text: Any, context: Context) -> TimeZero | float:
-    if text in get_args(TimeZero):
-        return cast(TimeZero, text)
-    with retold(UnitError, UnitError, "write file, window, top or a time: "):
-        return parse_quantity(text, time_unit(context))
+class TimeOfFile(Section):
+    """An instant that each data file holds as a scalar, on its own clock: the delay of its trigger."""
+
+    from_file: Annotated[str, Field(min_length=1)]
+    """Name of a scalar in each data file, e.g. of a line ``# delay = 7.0``, or of a column with one value a data set
+    (data.by)."""
+    unit: Annotated[str, unit_of(time_unit)]
+    """Unit of that scalar in the file."""
+    plus: Annotated[float, quantity(time_unit, "any")] = 0.0
+    """A time that is added to it, the same for all files: from the trigger to the pulse's arrival."""
+
+
+class ZeroOfFile(NamedTuple):
+    """A scalar of each file, and what is added to it in the model's unit."""
+
+    scalar: Column
+    plus: float
+
+
+TIME_OR_SCALAR = {"anyOf": [TEXT, TimeOfFile.model_json_schema()]}
+
+
+def read_time_zero(written: Any, context: Context) -> TimeZero | float | ZeroOfFile:
+    if isinstance(written, Mapping):
+        it = TimeOfFile.model_validate(written, context=context)
+        return ZeroOfFile(Column(it.from_file, it.unit, time_unit(context)), it.plus)
+    if written in get_args(TimeZero):
+        return cast(TimeZero, written)
+    with retold(UnitError, UnitError, "write file, window, top, a time or {from_file: NAME, unit: UNIT}: "):
+        return parse_quantity(written, time_unit(context))
 
 
 def _files(written: str | tuple[str, ...], context: Context) -> tuple[str, ...]:
@@ -186,9 +211,12 @@ class Data(Section):
     seen in the whole file."""
     columns: Annotated[Columns, OfObservable("column role")]
     window: WindowSection = Field({}, validate_default=True)
-    time_zero: Annotated[TimeZero | float, Made(read_time_zero)] = Field("file", validate_default=True)
+    time_zero: Annotated[TimeZero | float | ZeroOfFile, Made(read_time_zero, json=TIME_OR_SCALAR)] = Field(
+        "file", validate_default=True
+    )
     """Where the model's clock starts: file (the file's own zero), window (the first observation used), top (the vertex
-    of a parabola through the readings about the largest), or a time."""
+    of a parabola through the readings about the largest), a time, or ``{from_file: delay, unit: us}``, an instant that
+    each file states as a scalar."""
     weights: Annotated[Weighing | None, WEIGHTS] = None
     """How often each observation counts, beside ``assimilation.weights``: a list, ``{column: NAME}``,
     ``{zero_near_minima: 2 us}``, or ``{function: ./weights.py:name}``. Other than 0 and 1 they are not Bayesian."""

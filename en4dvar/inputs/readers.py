@@ -252,13 +252,15 @@ def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero
         raise DataError(f"{path}: {len(values)} usable observations; at least {fewest} are needed")
 
 
+def scalar_of(column: Column, scalars: Mapping[str, float], path: Path, what: str) -> float:
+    """A scalar of a file in the model's unit. Raises :class:`DataError` where the file holds none of the name."""
+    if column.name not in scalars:
+        raise DataError(f"{path}: no scalar {column.name!r} for {what}{suggest(column.name, scalars)}")
+    return float(convert(scalars[column.name], column.unit, column.target))
+
+
 def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
-    if step.column is None:
-        value = step.value
-    elif step.column.name not in scalars:
-        raise DataError(f"{path}: no scalar {step.column.name!r} for the time step{suggest(step.column.name, scalars)}")
-    else:
-        value = convert(scalars[step.column.name], step.column.unit, step.column.target)
+    value = step.value if step.column is None else scalar_of(step.column, scalars, path, "the time step")
     if not value > 0:
         raise DataError(f"{path}: the time step {value:g} is not positive")
     return value

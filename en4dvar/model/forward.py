@@ -112,7 +112,8 @@ class Alternative:
     observables and parameters, but for those that it has in addition, whose values are ``constants``; ``values`` and
     ``times`` multiply the observations and their errors; ``parameters`` are factors of a parameter's value where it is
     fixed, of the centre of its prior where it is estimated. One about the readings of an ``observable`` is told where
-    all readings are of that.
+    all readings are of that. ``options`` are those of ``en4dvar run`` that make it the assumption of a run, "" where
+    what is to be entered is for the user to say.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Alternative:
     parameters: Mapping[str, float] = field(default_factory=dict)
     observable: str = ""
     constants: Mapping[str, float] = field(default_factory=dict)
+    options: str = ""
 
 
 @dataclass(frozen=True)

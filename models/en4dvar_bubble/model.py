@@ -90,9 +90,12 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     @property
     def validity(self) -> tuple[ValidityLimit, ...]:  # type: ignore[override]
-        """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
+        """The largest Mach number of the wall that the radial equation can bear, and where that is said; and that the
+        grid holds the layer of gas which condensing vapour leaves at the wall.
+        """
         value, source = MACH_LIMITS[self.radial]
-        return (ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source),)
+        mach = ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source)
+        return (mach, SMEARING) if self.vapour == "transport" else (mach,)
 
     @property
     def path_parameters(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -207,8 +210,17 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return paths
 
 
+SMEARING = ValidityLimit(
+    "smeared",
+    0.0,
+    label="what the layer of gas at the wall is smeared over, in radii, as the grid cannot hold it (model.nodes; docs/"
+    "solver.md)",
+    source="docs/solver.md",
+)
 PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
 NO_STIFFENING, STIFFENED = {ALPHA.name: 0.0}, 0.1
+NOTHING: Mapping[str, str] = MappingProxyType({})
+SATURATED, NO_VAPOUR = {"vapour_pressure": "saturated"}, {"vapour_pressure": "'0 Pa'"}
 NEARBY = Wall(3.0, relative=True), "three times R_max"
 NEARBY_DRIVEN = Wall(3e-3), "3 mm"
 MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
@@ -233,9 +245,17 @@ def _names(model: ForwardModel | Dynamics, constants: Collection[str] = ()) -> l
     return [p.name for p in model.parameters if p.name not in said]
 
 
+def _as_options(model: Mapping[str, str], **others: Mapping[str, str]) -> str:
+    """Keys of sections, and their values, as options of ``en4dvar run``."""
+    sections = {"model": model, **others}
+    return " ".join(f"--set {of}.{key}={value}" for of, keys in sections.items() for key, value in keys.items())
+
+
 def _alternatives(model: Dynamics) -> Iterator[Alternative]:
-    def changed(name: str, words: str, **options: Any) -> Alternative:
-        return Alternative(name, words, replace(cast(Any, model), **options))
+    def changed(name: str, words: str, said: Mapping[str, str] = NOTHING, **options: Any) -> Alternative:
+        """``said``: keys of the model, and their values, beside those of the ``options`` that are called so."""
+        keys = {key: it for key, it in options.items() if isinstance(it, str)} | dict(said)
+        return Alternative(name, words, replace(cast(Any, model), **options), options=_as_options(keys))
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
     saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
@@ -244,7 +264,8 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
     if stiffens := next((it for it in REGISTRY.values() if (type(model.law), NO_STIFFENING) in it.limits), None):
         words = f"the gel stiffened (law: {stiffens.name}, alpha: {STIFFENED:g})"
-        yield replace(changed("stiffening", words, law=stiffens()), constants={ALPHA.name: STIFFENED})
+        asked = _as_options({"law": stiffens.name}, parameters={ALPHA.name: f"{STIFFENED:g}"})
+        yield replace(changed("stiffening", words, law=stiffens()), constants={ALPHA.name: STIFFENED}, options=asked)
     for name, key, factor, words in MEDIUM:
         if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
             of = "S" if name == "surface_tension" else name
@@ -255,18 +276,18 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     else:
-        cold = replace(model, medium_heat="cold")
-        simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
         words = "the gas were polytropic (gas: polytropic)"
-        yield Alternative("gas_model", words, replace(cast(Any, simple), gas="polytropic"))
+        of_vapour = ("none", SATURATED, saturated) if model.vapour == "transport" else (model.vapour, NOTHING, medium)
+        vapour, said, its = of_vapour
+        yield changed("gas_model", words, said, gas="polytropic", medium_heat="cold", vapour=vapour, medium=its)
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
     if medium.p_v and "p_v" not in model.named:
-        yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
+        yield changed("vapour", "there were no vapour in the bubble", NO_VAPOUR, medium=replace(medium, p_v=0.0))
     elif model.vapour != "none":  # and p_v is no parameter
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
     elif "p_v" not in model.named:
-        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
+        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", SATURATED, medium=saturated)
     yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
     yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
     yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")

@@ -17,7 +17,7 @@ from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.driver import Solution, System
-from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
+from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH, SMEAR
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 
@@ -68,7 +68,11 @@ class Paths(Batch):
         return self._fields[name]
 
     def largest(self, name: str) -> Array:
-        """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
+        """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants. What
+        a whole path is smeared by.
+        """
+        if name == "smeared":
+            return self.solution.record[:, SMEAR]
         if name != "wall_mach":
             return np.asarray(np.abs(self[name]).max(axis=1))
         if self.model.radial == "rayleigh-plesset":  # its equations know no speed of sound
@@ -77,6 +81,8 @@ class Paths(Batch):
 
     def beyond(self, limit: ValidityLimit) -> Array:
         """(N,) since when (s) the wall is faster than the radial equation bears, +inf: never; see :meth:`largest`."""
+        if limit.name == "smeared":
+            return np.where(self.largest(limit.name) > limit.value, -np.inf, np.inf)
         if self.model.radial == "rayleigh-plesset":
             over = np.abs(self["Rdot"]) / self.medium(1).c > limit.value
             return np.asarray(np.where(over, self.times, np.inf).min(axis=1))

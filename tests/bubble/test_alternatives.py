@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.medium import saturated_vapour_pressure
+from en4dvar_bubble.settings import BubbleSettings
 
 SETTINGS = AssimilationSettings(starts=3, refine="none")  # what is predicted is linear: that of Gaussians
 STD = 1.4e-6
@@ -202,3 +204,34 @@ def test_the_kernels_sum_to_the_degrees_of_freedom(fits, start):
     problem, analysis = fits[start]
     of_law = [problem.prior.names.index(name) for name in analysis.ledger.parameters]
     np.testing.assert_allclose(analysis.ledger.kernel.sum(axis=1), analysis.dfs_per_parameter[of_law], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"vapour": "transport", "medium_heat": "conducting"},
+        {"vapour_pressure": "saturated"},
+        {"gas": "polytropic"},
+        {"start": "acoustic"},
+    ],
+    ids=str,
+)
+def test_the_options_of_an_alternative_make_its_model(settings):
+    """Those that a result prints where the readings speak for it."""
+    said = {"law": "neo-hookean-kelvin-voigt", "start": "laser", "gas": "heat", **settings}
+    told = [it for it in BubbleModel.from_settings(BubbleSettings.model_validate(said)).alternatives if it.options]
+    assert {"stiffening", "gas_model", "vapour"} <= {it.name for it in told}
+    for alternative in told:
+        changed, words = dict(said), shlex.split(alternative.options)
+        for key, _, value in (word.partition("=") for word in words if word != "--set"):
+            section, _, name = key.partition(".")
+            if section == "model":
+                changed[name] = value
+            else:
+                assert float(value) == alternative.constants[name]
+        made = BubbleModel.from_settings(BubbleSettings.model_validate(changed))
+        other = alternative.model
+        assert (type(made.law), made.gas, made.vapour, made.medium_heat) == (
+            type(other.law), other.gas, other.vapour, other.medium_heat
+        ), alternative.name  # fmt: skip
+        assert made.medium.p_v == pytest.approx(other.medium.p_v)

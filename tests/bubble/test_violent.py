@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from en4dvar.diagnosis.honesty.checks import validity
 from en4dvar_bubble import BubbleModel, get_law
 from en4dvar_bubble.solver.driver import preset
 from en4dvar_bubble.solver.integrate import REJECTED, SMEAR, STEPS
@@ -40,6 +41,16 @@ def test_every_member_completes(all_physics):
     assert not all_physics.solution.status.any()
     assert np.isfinite(all_physics["R"]).all()
     assert 10 < np.sum(all_physics.solution.record[:, SMEAR] > 0) < 40  # both kinds were tried
+
+
+def test_a_result_says_that_its_members_are_smeared(all_physics):
+    """Their paths are off by 4 % of R_max and more, and nothing else tells."""
+    limits = all_physics.model.validity
+    extremes = np.stack([all_physics.largest(limit.name) for limit in limits], axis=1)
+    since = np.stack([all_physics.beyond(limit) for limit in limits], axis=1)
+    found = [c.words for c in validity(limits, extremes, since, TIMES, np.full(len(TIMES), 0.02))]
+    assert any("the layer of gas at the wall is smeared" in words for words in found)
+    assert not any(limit.name == "smeared" for limit in replace(all_physics.model, vapour="none").validity)
 
 
 def test_smearing_vanishes_on_a_finer_grid(all_physics):

@@ -207,7 +207,7 @@ def test_rows_of_a_matrix_are_columns_where_it_is_flat(tmp_path: Path) -> None:
     assert problem.observations.values.min() == pytest.approx(1e-6 * rows[1].min())
 
 
-@pytest.mark.parametrize("name", ["dR_um", "R_err_um", "sigma_um", "radius_std", "R std [nm]"])
+@pytest.mark.parametrize("name", ["dR_um", "R_err_um", "sigma_um", "radius_std", "R std [nm]", "± SE (um)", "± (nm)"])
 def test_a_column_that_looks_like_errors_is_told_and_can_be_used_as_said(tmp_path: Path, name: str) -> None:
     head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
     Path("b.csv").write_text("\n".join([f"{head},{name}", *(f"{row},{1 + i % 2}" for i, row in enumerate(rows)), ""]))
@@ -219,6 +219,14 @@ def test_a_column_that_looks_like_errors_is_told_and_can_be_used_as_said(tmp_pat
     (problem,) = build(load_config("b.yaml"))
     stds = problem.observations.noise.std[:2] * (1e9 if "nm" in name else 1e6)
     assert sorted(stds) == pytest.approx([1, 2])
+
+
+def test_errors_in_per_cent_are_told(tmp_path: Path) -> None:
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    Path("b.csv").write_text("\n".join([f"{head},err (%)", *(f"{row},2" for row in rows), ""]))
+    done = call("init", "--data", "b.csv")
+    assert done.exit_code == 0, done.output
+    assert "'err (%)' looks like errors of the radii, and is not used; to use them, write them" in done.stderr
 
 
 def test_the_columns_that_most_files_of_a_folder_have_are_taken(tmp_path: Path) -> None:

@@ -90,6 +90,20 @@ def test_bubbles_whose_clocks_begin_at_other_instants_of_the_pulse_are_named(lat
     )
 
 
+def test_a_delay_that_each_file_states_begins_its_clock() -> None:
+    Path("d").mkdir()
+    times, delays = np.arange(5.6, 34.0, 1.0), (0.0, 2.0, 7.0, 21.0)
+    for number, (late, size) in enumerate(zip(delays, (0.3e-6, 0.43e-6, 0.6e-6, 0.5e-6), strict=True)):
+        radius = 1e6 * bubble_path("quadratic-kelvin-voigt", {**SOFT, "R0": size}, 1e-6 * times).R[0].values
+        rows = [f"{t + late:.2f},{r:.3f}" for t, r in zip(times, radius, strict=True)]
+        Path(f"d/b{number}.csv").write_text("\n".join([f"# delay_us = {late}", "t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "d", "--start", "acoustic")
+    assert done.exit_code == 0, done.output
+    assert "one time_zero is for all files" not in done.stderr
+    zeros = [1e6 * problem.observations.zero for problem in build(proposed(Path("d.yaml")))]
+    np.testing.assert_allclose(np.diff(zeros), np.diff(delays), atol=1e-6)
+
+
 def test_a_window_to_the_end_says_why_it_does_not_end_before() -> None:
     of_file(STIFF, 0.0)
     (line,) = (line for line in Path("pulse.yaml").read_text().splitlines() if line.startswith("  window:"))

@@ -60,6 +60,20 @@ def test_the_clock_can_start_at_the_top_that_each_data_set_shows(tmp_path: Path)
         build(load_config(path, {"data.time_zero": "top", "data.window": {"from": "start"}}))
 
 
+def test_the_clock_can_start_where_each_file_says(tmp_path: Path) -> None:
+    path = write_toy(tmp_path, ("  path: toy.csv\n", "  path: [toy.csv, late.csv]\n"))
+    for name, delay in (("toy", 0.0), ("late", 7.0)):
+        rows = "".join(f"{t + delay},{100 - t}\n" for t in range(4, 90, 5))
+        (tmp_path / f"{name}.csv").write_text(f"# delay = {delay}\nt_ms,x_um\n{rows}")
+    problems = build(load_config(path, {"data.time_zero": "{from_file: delay, unit: ms}"}))
+    assert [problem.observations.zero for problem in problems] == pytest.approx([0.0, 7e-3])
+    np.testing.assert_allclose(problems[0].observations.times, problems[1].observations.times)
+    later = build(load_config(path, {"data.time_zero": "{from_file: delay, unit: ms, plus: 3 ms}"}))
+    assert [problem.observations.times[0] for problem in later] == pytest.approx([1e-3, 1e-3])
+    with pytest.raises(DataError, match=r"no scalar 'delai' for data.time_zero; did you mean 'delay'"):
+        build(load_config(path, {"data.time_zero": "{from_file: delai, unit: ms}"}))
+
+
 def test_the_trough_after_the_window_is_named(tmp_path: Path) -> None:
     """Counted as ``data.window.to`` counts it, from the window's start, as far as readings are predicted."""
     path = write_toy(tmp_path, data=csv_text(121))

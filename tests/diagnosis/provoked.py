@@ -8,12 +8,23 @@ from typing import Any
 
 import numpy as np
 from estimation.test_lost_frame import problem as filmed
-from toys import Decay, Fragile, Toy, Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
+from toys import (
+    Decay,
+    Fragile,
+    Linear,
+    Toy,
+    Vectorised,
+    Wave,
+    make_observations,
+    make_problem,
+    with_discrepancy,
+    with_noise,
+)
 from varying_models import Ramp
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.forward import Observable, ValidityLimit
+from en4dvar.model.forward import Alternative, Observable, ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk
@@ -144,6 +155,32 @@ def ramp(knots) -> InverseProblem:
     return constant.varied([RandomWalk.of(model, first, knots, 0.5)])
 
 
+class Offered(Linear):
+    """Offers a curve with a wave of another height."""
+
+    def __init__(self, height: float) -> None:
+        super().__init__(TWO)
+        self.height = height
+
+    def curve(self, theta, t):
+        return super().curve(theta, t) + self.height * np.sin(9 * t)
+
+    def rate(self, theta, t):
+        return super().rate(theta, t) + 9 * self.height * np.cos(9 * t)
+
+    @property
+    def alternatives(self):
+        other, options = Offered(0.6 - self.height), "" if self.height else "--set model.height='0.6 m'"
+        return (
+            Alternative("wave", "there were no wave" if self.height else "there were a wave", other, options=options),
+        )
+
+
+def waving(height: float = 0.0) -> InverseProblem:
+    """Readings with that wave, and a model that has it, or offers it."""
+    return replace(make_problem(Offered(0.6), (1.0, 0.5), k=40), model=Offered(height))
+
+
 def turned(window: int) -> InverseProblem:
     """A line that turns where the window of so many readings ends."""
     model, times = Vectorised(TWO), np.linspace(0.2, 4.0, 20)
@@ -179,6 +216,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "residual-structure": lambda: run(bent()),
     "odd-residuals": lambda: run(spiked()),
     "discrepancy-found": lambda: run(waved(3.0)),
+    "other-assumption": lambda: run(waving()),
     "one-descent": lambda: run(linear(), starts=1),
     "start-moved": lambda: run(
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2

@@ -22,6 +22,7 @@ from diagnosis.provoked import (
     run,
     turned,
     waved,
+    waving,
 )
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
@@ -93,7 +94,8 @@ def shorter(p: InverseProblem, said: re.Match[str]) -> InverseProblem:
 
 
 def wider(p: InverseProblem, said: re.Match[str]) -> InverseProblem:
-    terms = (replace(t, std=int(said[2]) * t.std) if t.parameter.name == said[1] else t for t in p.prior.terms)
+    wide = said[1].split(" and ")
+    terms = (replace(t, std=int(said[2]) * t.std) if t.parameter.name in wide else t for t in p.prior.terms)
     return replace(p, prior=Prior(tuple(terms)))
 
 
@@ -120,7 +122,7 @@ SAID: dict[str, Follow] = {
     r"the times err by about ([\d.e+-]+) s \(data\.error\.time_std": timed,
     r"data\.error\.robust: huber": robust,
     r"data\.window: \{to: ([\d.]+) s\}": shorter,
-    r"the prior of (\w+) about (\d+) times as wide": wider,
+    r"the prior of ([\w ]+) about (\d+) times as wide": wider,
     r"fix it \(parameters\.(\w+): a value\)": fixed,
     r"assimilation\.weights: sum": equal,
 }
@@ -176,6 +178,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "readings-missing": linear,  # a model that gives them
     "residual-structure": lambda: make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05),  # a model with the wave
     "at-bound": in_bounds,
+    "other-assumption": lambda: waving(0.6),
     "upper-limit": lambda: near_zero(1.0),  # a larger value, or better readings
     "several-modes": positive,
     "discrepancy-found": lambda: with_discrepancy(  # a model that has the wave
@@ -229,6 +232,25 @@ def test_an_error_in_the_wrong_unit_is_told_as_such():
     assert "unit" not in " ".join(c.advice for c in again.cautions)
     in_mm = run(replace(problem, observations=replace(problem.observations, error_unit="mm")))
     assert "check the unit of data.error: 5e+05 mm is stated" in told(in_mm, "overstated-error").advice
+
+
+@pytest.mark.parametrize("std", [0.02, 0.1, 0.15])
+@pytest.mark.parametrize("scale", [(0.02, 1.0), (0.02, 0.02), (0.1, 0.02)], ids=str)
+def test_a_prior_that_is_widened_as_advised_contradicts_the_data_no_more(std, scale):
+    """Also where they know little: the wider the prior, the farther off they lead."""
+    model = Vectorised(TWO)
+    terms = [PriorTerm.normal(p, mean, s) for p, mean, s in zip(model.parameters, (-1.0, 2.0), scale, strict=True)]
+    a = run(make_problem(model, (1.0, 0.5), k=9, std=std, prior=tuple(terms)))
+    c = told(a, "prior-conflict")
+    assert c is not None
+    assert told(follow(a, c, None), "prior-conflict") is None, c.advice
+
+
+def test_an_assumption_for_which_the_readings_speak_is_told_with_the_option_that_makes_it():
+    c = told(run(waving()), "other-assumption")
+    assert re.match(r"the readings speak for another assumption: J would be lower by \d+ if there were a wave", c.words)
+    assert c.advice == "run with --set model.height='0.6 m', and compare both (en4dvar compare)"
+    assert told(run(waving(0.6)), "other-assumption") is None
 
 
 class Late(Vectorised):

@@ -50,7 +50,7 @@ def test_a_conflict_of_what_is_shared_is_told_and_no_interval_trusted():
         f"prior and data conflict: the minimum lies far from the prior mean (a (gel) at {MEAN + STD * z:.3g} m where "
         f"the prior says -0.1 to 0.9 m: {z:+.1f} prior standard deviations)"
     )
-    assert "make the prior of a about 4 times as wide (parameters.a)" in conflict.advice
+    assert "make the prior of a at least 4 times as wide (parameters.a)" in conflict.advice
     assert conflict.severity == "serious"
     assert untrusted((conflict,), "a") == untrusted((conflict,), "b") == ("prior-conflict",)
 
@@ -59,7 +59,7 @@ def test_a_conflict_of_what_a_data_set_has_of_its_own_names_the_data_set():
     joint = campaign(0.3, (0.5, -8.0, 0.2), np.random.default_rng(0))
     (conflict,) = told(joint)
     assert f"(b of set1 at {MEAN + STD * exact(joint)[2]:.3g} m where" in conflict.words
-    assert "make the prior of b about 4 times as wide (parameters.b)" in conflict.advice
+    assert "make the prior of b at least 4 times as wide (parameters.b)" in conflict.advice
 
 
 def test_an_estimate_made_without_an_odd_data_set_is_examined_too():

@@ -38,3 +38,16 @@ def test_marginals_are_those_of_a_linear_problem(mixture):
     ]
     inverse = np.einsum("bi,ij->bij", 1 / variance, np.eye(3))
     assert log_marginal(mixture, mean, inverse) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "far",
+    [np.ones((3, 3)), np.zeros((3, 3)), np.full((3, 3), np.nan), -np.eye(3)],
+    ids=["singular", "zero", "nan", "negative"],
+)
+def test_a_population_that_rounding_makes_no_density_of_explains_nothing(mixture, far):
+    """Forty bubbles with wild readings ended in a division by zero, at a walker far out among what is common."""
+    inverse = np.stack([np.eye(3), far])
+    usual, none = log_marginal(mixture, np.zeros((2, 3)), inverse)
+    assert np.isfinite(usual)
+    assert none == -np.inf

@@ -11,6 +11,7 @@ import numpy as np
 
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.honesty.widening import Wider, contradicts, farthest
 from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
@@ -162,29 +163,33 @@ def _chance(probability: float) -> str:
     return f"{probability:.1g}" if probability > 1e-6 else "below 1e-6"
 
 
-def conflict(prior: Prior, centre: Array, timed: bool = False) -> Findings:
+def conflict(prior: Prior, centre: Array, timed: bool = False, wide: Wider | None = None) -> Findings:
     """A posterior centre (n,) far from the prior; ``timed``: the stated errors hold errors of the times, which may be
-    too large."""
+    too large; ``wide``: of :func:`far_from`."""
     terms = dict(zip(prior.names, prior.terms, strict=True))
-    return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre), timed)
+    return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre), timed, wide)
 
 
-def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array, timed: bool = False) -> Findings:
-    """A minimum of J where 2 J_b is beyond what χ²_n exceeds once in 4000, or one of the z² beyond what the largest of
-    n does.
+def far_from(
+    terms: Mapping[str, PriorTerm],
+    z: Array,
+    white: Array,
+    timed: bool = False,
+    wide: Wider | None = None,
+) -> Findings:
+    """A minimum of J that contradicts the prior (:func:`~en4dvar.diagnosis.honesty.widening.contradicts`).
 
     ``z`` (n,) are prior standard deviations from the mean of each of ``terms``, by what it is called; ``white`` (n,)
-    are its white coordinates.
+    are its white coordinates. ``wide``: which priors are to be how many times as wide, where that is known.
     """
-    each = diag.TAIL / 2
-    together, alone = diag.chi2_interval(len(z), each)[1], diag.chi2_interval(1, each / len(z))[1]
-    if float(white @ white) <= together and np.max(z**2) <= alone:
+    if not contradicts(z, white):
         return
-    names, priors, worst = list(terms), list(terms.values()), np.argsort(-np.abs(z))
-    far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
+    names, priors, far = list(terms), list(terms.values()), farthest(z)
     places = "; ".join(_far(names[j], priors[j], float(z[j])) for j in far)
     told = caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
-    yield replace(told, advice=_wider(priors[worst[0]].parameter.name, float(z[worst[0]]), timed))
+    at_least, (which, factor) = "about" if wide else "at least", wide or (far[:1], math.ceil(abs(z[far[0]]) / 2))
+    asked = [priors[j].parameter.name for j in which]
+    yield replace(told, advice=_wider(asked, float(z[far[0]]), f"{at_least} {factor} times", timed))
 
 
 def _far(name: str, term: PriorTerm, z: float) -> str:
@@ -195,9 +200,9 @@ def _far(name: str, term: PriorTerm, z: float) -> str:
     return f"{name} at {shown(value, p)} where {said}: {z:+.1f} prior standard deviations"
 
 
-def _wider(name: str, z: float, timed: bool) -> str:
-    """What to do about a parameter so many prior standard deviations from its prior mean."""
-    if name == NOISE_SCALE.name and z < 0:
+def _wider(names: Sequence[str], z: float, factor: str, timed: bool) -> str:
+    """What to do about parameters of which the first is so many prior standard deviations from its prior mean."""
+    if names[0] == NOISE_SCALE.name and z < 0:
         of_times = (
             "if a camera keeps its time better than data.error.time_std says (en4dvar track states a tenth of the "
             "exposure), put its jitter there (--set data.error.time_std='3 ns')"
@@ -207,10 +212,8 @@ def _wider(name: str, z: float, timed: bool) -> str:
             "error that all share belongs to a parameter (reading_scale, reading_offset); "
             + (of_times if timed else "for a movie, give its --exposure to en4dvar track")
         )
-    return (
-        f"check units and data; if both are right, make the prior of {name} about {math.ceil(abs(z) / 2)} times as "
-        f"wide (parameters.{name}) and say so"
-    )
+    priors, keys = " and ".join(names), " and ".join(f"parameters.{name}" for name in names)
+    return f"check units and data; if both are right, make the prior of {priors} {factor} as wide ({keys}) and say so"
 
 
 def shown(value: float, p: Parameter) -> str:

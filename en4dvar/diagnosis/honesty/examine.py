@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.diagnostics import SHORT_STEP, UNSEEN, active_members
+from en4dvar.diagnosis.diagnostics import DECISIVE, SHORT_STEP, UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
+from en4dvar.diagnosis.honesty.widening import enough
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.caution import Caution, caution, of_several_modes, untrusted, worst_first
@@ -71,7 +72,8 @@ def examine(
         *checks.fit(chi2 * n_used, n_used, dfs, factor),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
-        *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing) if whole else ()),
+        *other_assumptions(a),
+        *(conflict(a, control, alive) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
@@ -131,6 +133,29 @@ def _validity(a: Analysis, alive: Mask) -> checks.Findings:
         which, leverage = residuals.which, residuals.leverage
     if limits:
         yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
+
+
+def conflict(a: Analysis, control: ControlEnsembles, alive: Mask) -> checks.Findings:
+    """Of the minimum and the prior."""
+    timed = a.observations.noise.timed and not a.timing
+    prior, centre = a.problem.prior, control.centre
+    return checks.conflict(prior, centre, timed, enough(prior, centre, control.posterior[alive]))
+
+
+def other_assumptions(analysis: Analysis) -> checks.Findings:
+    """An alternative with which J is lower by what chance makes of any of so many at most once in :data:`DECISIVE`:
+    all have the same parameters and priors, so that J tells of their evidences.
+    """
+    limit = math.log(DECISIVE * max(1, len(analysis.what_if)))
+    offered, estimated = {it.name: it for it in analysis.problem.alternatives}, {*analysis.problem.prior.names}
+    # a shift of a prior has a check of its own
+    of_model = [s for s in analysis.what_if if s.settled and not estimated & offered[s.name].parameters.keys()]
+    best = min(of_model, key=lambda shift: shift.cost_change, default=None)
+    if best is None or not best.cost_change < -limit:
+        return
+    words = f"the readings speak for another assumption: J would be lower by {-best.cost_change:.3g} if {best.words}"
+    general, options = caution("other-assumption", words), offered[best.name].options
+    yield replace(general, advice=f"run with {options}, and compare both (en4dvar compare)") if options else general
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:

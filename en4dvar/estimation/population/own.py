@@ -101,7 +101,9 @@ class Mixture(NamedTuple):
 
 @kernel
 def condition(precision: Array, linear: Array, inverse: Array, pull: Array, middle: Array, root: Array) -> float:
-    """A⁻¹b and the lower root of A = Λ + D⁻¹, b = η + D⁻¹ν; returns ½ bᵀA⁻¹b − ½ ln|A|."""
+    """A⁻¹b and the lower root of A = Λ + D⁻¹, b = η + D⁻¹ν; returns ½ bᵀA⁻¹b − ½ ln|A|, NaN where rounding leaves no
+    root.
+    """
     n = linear.size
     value = 0.0
     for i in range(n):
@@ -110,6 +112,8 @@ def condition(precision: Array, linear: Array, inverse: Array, pull: Array, midd
             for k in range(j):
                 total -= root[i, k] * root[j, k]
             if i == j:
+                if not total > 0.0:
+                    return np.nan
                 root[i, i] = np.sqrt(total)
                 value -= np.log(root[i, i])
             else:
@@ -144,7 +148,9 @@ def draw_conditioned(middle: Array, root: Array, z: Array, out: Array) -> None:
 
 @kernel
 def log_marginal(mixture: Mixture, mean: Array, inverse: Array) -> Array:
-    """(B,) ln ∫ L(x) N(x; mean, inverse⁻¹) dx, for ``mean`` (B, n) and ``inverse`` (B, n, n)."""
+    """(B,) ln ∫ L(x) N(x; mean, inverse⁻¹) dx, for ``mean`` (B, n) and ``inverse`` (B, n, n). −∞ of an ``inverse`` that
+    has no root by rounding: a walker far out among what is common tries such.
+    """
     n_parts, n = mixture.linear.shape
     middle, root, logs, out = np.empty(n), np.zeros((n, n)), np.empty(n_parts), np.empty(mean.shape[0])
     nothing = np.zeros(n)
@@ -153,8 +159,11 @@ def log_marginal(mixture: Mixture, mean: Array, inverse: Array) -> Array:
         own = condition(inverse[b], nothing, 0.0 * inverse[b], nothing, middle, root) + 0.5 * mean[b] @ pull
         for m in range(n_parts):
             part = condition(mixture.precision[m], mixture.linear[m], inverse[b], pull, middle, root)
-            logs[m] = mixture.constant[m] + part
+            logs[m] = mixture.constant[m] + part if np.isfinite(part) else -np.inf
         top = logs.max()
+        if not (np.isfinite(own) and np.isfinite(top)):
+            out[b] = -np.inf
+            continue
         out[b] = top + np.log(np.sum(np.exp(logs - top))) - own
     return out
 

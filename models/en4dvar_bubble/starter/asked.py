@@ -18,8 +18,12 @@ _TIME = re.compile(r"(?i)(t|time|zeit)([ _(\[].*)?")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _SIZE = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
 _AS_PIXELS, _AS_FRAMES = ("px", "pixel", "pixels"), ("frame", "frames")
-_OF = r"err(or)?s?|std|sd|sigma|unc(ertainty)?"
-_ERRORS = re.compile(rf"(?i)({_OF})([ _]*(r|radius))?|(d|u|delta)[ _]*(r|radius)|(r|radius)[ _]*({_OF})")
+_OF = r"err(or)?s?|st\.? ?d(ev(iation)?)?\.?|standard[ _](error|deviation)|sd|sem?|sigma|σ|unc(ertainty)?|±|\+/?-"
+_R = r"(r|radius)"
+_ERRORS = re.compile(
+    rf"(?i)(±|\+/?-)?[ _]*({_OF})([ _]*(of[ _]*)?{_R})?|(±|\+/?-|d|u|delta|δ)[ _]*{_R}|{_R}[ _]*({_OF})"
+)
+_PER_CENT = re.compile(r"[ _(\[]*%[ )\]]*$")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
@@ -55,7 +59,8 @@ class Asked:
     def errors(self) -> list[str]:
         """Columns that are called as standard deviations of radii are."""
         columns = self.contents.columns
-        return [name for name in columns if _ERRORS.fullmatch(without_unit(name)) and name != self.radius_column]
+        bare = {name: without_unit(_PER_CENT.sub("", name)) for name in columns}
+        return [name for name in columns if _ERRORS.fullmatch(bare[name]) and name != self.radius_column]
 
     @property
     def unused(self) -> list[str]:
@@ -64,11 +69,12 @@ class Asked:
             return []
         units = {name: unit_in(name, "m") for name in self.errors}
         said = {name: f", unit: {unit}" if unit not in (None, self.radius_unit) else "" for name, unit in units.items()}
-        return [
-            f"column {name!r} looks like errors of the radii, and is not used; to use it write in the section error "
-            f"'radius_std: {{column: {quoted(name)}{unit}}}'"
+        use = {
+            name: f"to use it write in the section error 'radius_std: {{column: {quoted(name)}{unit}}}'"
             for name, unit in said.items()
-        ]
+        }
+        use |= {name: "to use them, write them into the file as lengths" for name in units if _PER_CENT.search(name)}
+        return [f"column {name!r} looks like errors of the radii, and is not used; {how}" for name, how in use.items()]
 
     def shown(self, name: str) -> str:
         """A column or scalar and what it holds, in words."""

@@ -36,6 +36,7 @@ DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
 LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
 ODD_SCALE = 50.0  # of the median of all files: bubbles of one experiment are closer
+_DELAY = re.compile(r"(?i)(.*\.)?((trigger|pulse|camera|laser)[ _-]?)?(delay|trigger|time[ _]?zero|t[ _]?zero|t_?0)")
 AT_REST = (0.02, 0.9)  # of R_max
 PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
 
@@ -162,8 +163,9 @@ def propose_config(
             f"and units, here {names}; write the others under these names, in the same units, and propose again"
         )
     common = _largest(readings, TRACKED_COMMON) if errors else 0.0
+    delay, delays = _delays(readings, source)
     proposal = propose(
-        {name: (series.times, series.values) for name, series in readings.items()},
+        {name: (series.times - delays.get(name, 0.0), series.values) for name, series in readings.items()},
         start,
         law,
         medium,
@@ -174,7 +176,7 @@ def propose_config(
     odd = [words for name, series in readings.items() for words in _left_out(name, series)]
     if any(ODD.keys() & series.left_out.keys() for series in readings.values()):
         source = replace(source, layout=replace(layout, outliers="leave out"))
-    proposal = _with_rest(proposal, readings, source.radius[1])
+    proposal = _with_delay(_with_rest(proposal, readings, source.radius[1]), delay)
     if errors:
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
@@ -255,6 +257,42 @@ def _steps(readings: Mapping[str, Readings], source: Source) -> list[str]:
     return told
 
 
+def _delays(readings: Mapping[str, Readings], source: Source) -> tuple[dict[str, str], dict[str, float]]:
+    """The scalar that every file states of its trigger, with its unit, and its value (s) in each; none where a reading
+    lies before it, or several bubbles' tops agree better without it.
+    """
+    names = {
+        name for series in readings.values() for name in series.scalars if _DELAY.fullmatch(without_unit(name, "s"))
+    }
+    if (
+        len(names) != 1
+        or source.time is None
+        or not all(names <= series.scalars.keys() for series in readings.values())
+    ):
+        return {}, {}
+    (name,) = names
+    unit = unit_in(name, "s") or source.time[1]
+    delays = {key: convert(series.scalars[name], unit, "s") for key, series in readings.items()}
+    tops = {key: float(series.times[np.argmax(series.values)]) for key, series in readings.items()}
+    apart = np.ptp([tops[key] - delays[key] for key in tops]) > np.ptp(list(tops.values()))
+    if apart or any(series.times[0] < delays[key] for key, series in readings.items()):
+        return {}, {}
+    return {"from_file": name, "unit": unit}, delays
+
+
+def _with_delay(proposal: Proposal, delay: Mapping[str, str]) -> Proposal:
+    """With the clock of each file that begins at its ``delay``, unless it begins at the file's own top."""
+    words = "the delay that each file states; what is added to it puts the R_max of the guess on that of the data"
+
+    def with_it(line: Entry) -> Entry:
+        plus = None if line.value == "file" else line.value
+        return replace(line, value=braced(**delay, plus=plus), comment=words)
+
+    asked = bool(delay)
+    lines = [with_it(it) if asked and it.key == "time_zero" and it.value != "top" else it for it in proposal.data]
+    return replace(proposal, data=tuple(lines))
+
+
 def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) -> Proposal:
     """The radius at rest of the files, where every one has such a scalar that suits its readings in their unit."""
     names = {name for series in readings.values() for name in series.scalars if _REST.fullmatch(name)}
@@ -307,10 +345,10 @@ def unit_in(name: str | None, kind: str) -> str | None:
         return None
 
 
-def without_unit(name: str) -> str:
+def without_unit(name: str, kind: str = "m") -> str:
     """A column's name without what :func:`unit_in` reads."""
     last = name.rpartition(".")[2]
-    return parted(last)[0] if unit_in(name, "m") else last
+    return parted(last)[0] if unit_in(name, kind) else last
 
 
 def run_name(data: str) -> str:

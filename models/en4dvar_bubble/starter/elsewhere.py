@@ -109,7 +109,8 @@ def clocks_apart(looks: Mapping[str, Look]) -> list[str]:
     off = {name: abs(at - usual) for name, at in grows.items() if abs(at - usual) > max(CLOCKS_APART, 0.5 * t_c)}
     words = (
         f"{listed(off, 5)}: the bubble grows up to {1e6 * max(off.values(), default=0.0):.3g} us before or after most, "
-        "and one time_zero is for all files: begin the times of each at its pulse"
+        "and one time_zero is for all files: begin the times of each at its pulse, or write the instant of the pulse "
+        "into each file as a line '# delay_us = 7.0', and propose again"
     )
     return [words] * bool(off)
 

@@ -37,25 +37,9 @@ from en4dvar_bubble.starter.look import (
     usable,
     without_rebound,
 )
+from en4dvar_bubble.starter.physics import SIMPLER, WHY, physics
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
-MODEL: Mapping[Start, Mapping[str, str]] = {
-    "acoustic": {"gas": "heat"},
-    "laser": {"gas": "heat", "vapour": "transport", "medium_heat": "conducting", "gas_change": "0.7"},
-}
-WHY = {
-    "heat": "the gas gives heat to the wall",
-    "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
-    "0.7": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
-    "viscosity_change": "std of ln of its change after the window: viscosity is not all that damps the first collapses",
-    "rtol": "of a coating that buckles J is smoother then, and the search for its minimum converges",
-    "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
-}
-# The quicker gas that a laser-induced bubble can be compared with; benchmarks/laser_gas.py has what it costs.
-SIMPLER: Mapping[Start, Mapping[str, str]] = {
-    "acoustic": {},
-    "laser": {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"},
-}
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
@@ -115,9 +99,8 @@ def propose(
     """
     looks, unseen = _looks(histories, start)
     views = list(looks.values())
-    chosen = views[0].start
-    model, law_name = built(chosen, law)
-    look = typical_look(views)
+    chosen, look = views[0].start, typical_look(views)
+    model, law_name = built(chosen, law, look)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(elsewhere.centred(model, medium), others, observed)
@@ -238,10 +221,10 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
     return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
 
 
-def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
+def built(start: Start, law: str | None, look: Look | None = None) -> tuple[BubbleModel, str]:
     """The model, and how the file names its law. Raises :class:`ConfigError` where no such law starts so."""
     name = qualified(law) if law else LAWS[start]
-    said: dict[str, object] = {**MODEL[start], "start": start, "law": name}
+    said: dict[str, object] = {**physics(start, look), "start": start, "law": name}
     with retold(ValueError, ConfigError, f"--law {name} --start {start}: "):
         model = BubbleModel.from_settings(BubbleSettings.model_validate(said))
         if start == "acoustic":
@@ -385,7 +368,7 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
         Entry("name", "bubble"),
         Entry("law", law, "others: en4dvar laws"),
         Entry("start", start, look.reason if look else "or " + ("laser" if start == "acoustic" else "acoustic")),
-        *(Entry(key, value, WHY[value]) for key, value in MODEL[start].items()),
+        *(Entry(key, value, WHY[value]) for key, value in physics(start, look).items()),
         *[Entry("rtol", "1e-8", WHY["rtol"])] * isinstance(model.law, MarmottantShell),
         *[Entry("viscosity_change", "1", WHY["viscosity_change"])] * _in_a_liquid(model),
     ]

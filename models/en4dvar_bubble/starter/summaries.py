@@ -18,7 +18,8 @@ from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.starter.config import Source
 from en4dvar_bubble.starter.elsewhere import Entry, known
-from en4dvar_bubble.starter.proposal import WHY, Proposal, built, example
+from en4dvar_bubble.starter.physics import WHY
+from en4dvar_bubble.starter.proposal import Proposal, built, example
 
 RADII = (1e-6, 0.1)  # m
 STRETCHES = (1.5, 50.0)  # R_max/R_eq
