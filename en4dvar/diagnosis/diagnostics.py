@@ -119,15 +119,16 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
     return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 
-def is_non_gaussian(shape: Mapping[str, float], scaled: bool = False) -> bool:
+def is_non_gaussian(shape: Mapping[str, float], doubted: bool = False) -> bool:
     """True if mean or spread of the ensemble are not the posterior's, from
-    :func:`~en4dvar.sampling.refine.examine_shape` and :func:`~en4dvar.sampling.refine.examine_tails`. ``scaled``: a
-    parameter is the scale of others, so that no posterior is Gaussian; an emulator may say that it is.
+    :func:`~en4dvar.sampling.refine.examine_shape` and :func:`~en4dvar.sampling.refine.examine_tails`. ``doubted``: a
+    parameter is the scale of others, so that no posterior is Gaussian, or an approximate scheme agrees little with J;
+    an emulator may say that it is.
     """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         return shape["mean_shift"] > MEAN_OFF or abs(shape["spread_ratio"] - 1) > SPREAD_OFF
     tails = any(key.startswith(("tail_mean", "tail_q")) for key in shape)
-    return scaled or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or tails
+    return doubted or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or tails
 
 
 def active_members(failures: Sequence[str]) -> Mask:

@@ -135,9 +135,13 @@ def parse_times(text: str, unit: str) -> Array:
 
 def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, float]:
     """``"1.4 um"`` or ``"1 % of maximum"`` in the unit of each series. Raises :class:`UnitError`."""
-    levels = {}
-    for name, observable in _observables(config).items():
-        spread = parse_error_std(text, observable.unit)
+    levels, observables = {}, _observables(config)
+    for name, observable in observables.items():
+        try:
+            spread = parse_error_std(text, observable.unit)
+        except UnitError as error:
+            each = "; of several series, '1 % of maximum' is of each" if len(observables) > 1 else ""
+            raise UnitError(f"--noise of {name}: {error}{each}") from None
         if not spread.value > 0:
             raise UnitError(f"the noise must be positive, not {text}")
         levels[name] = spread.absolute(float(simulation.series[name].max()))

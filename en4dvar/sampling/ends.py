@@ -22,18 +22,19 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.response.ledger import QUANTILES, weighted_quantiles
 from en4dvar.ensemble.linalg import shares_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.emulated_cost import DEGREES, RUNS_PER_TERM, EmulatedCost, ModelRuns, fitted_cost
 from en4dvar.sampling.emulated_draws import LARGEST
 
 NEARLY = 0.01  # of the Gaussian's rise, and beside it, by which J may differ from it at all members
 END = 3.0  # standard deviations to either side of the minimum, where J of the Gaussian has risen by 4.5
+WITHIN, STEEP = (END / 2, END / 4, END / 8), 3.0  # places before that, each after a rise of J by so much to the last
 SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
 FURTHER = 1.5  # times as far
 NEAR = 1000.0  # above the lowest J: runs up to there are fitted, where they suffice for more than the Gaussian has
-MISLED = 0.5  # of J, by which it may exceed emulated J: beyond, the point on the way is tried too
-TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
+MISLED = 0.5  # of J, by which it may exceed emulated J, and this the lowest there: beyond, a point is not x*
+TRIED, WIDTHS, AGAIN = 128, (2.0, 1.0, 0.5, 0.25), 4  # points about x*, so wide and so often, of lowest emulated J
 PLACES = 2001  # of a parameter, at which its density is known
 Costs = list[dict[float, float]]
 
@@ -82,18 +83,19 @@ class _Walk:
         if degree and near.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
             prior, observations = self.space.problem.prior, self.space.problem.observations
             emulated = fitted_cost(prior, observations, degree, near, 2 * n)
-            x, log_volume = self._lowest(emulated, x, self.about[sides])
-            expected, lowest[:] = emulated.cost(x), True
+            x, log_volume, lowest = self._lowest(emulated, x, self.about[sides])
+            expected = emulated.cost(x)
         costs = self._run(x)
         misled = np.flatnonzero(costs > expected + MISLED)
         if len(misled):
             instead = self._run(straight[misled])
+            lowest[misled] = False
             misled, instead = misled[instead < costs[misled]], instead[instead < costs[misled]]
-            x[misled], costs[misled], log_volume[misled], lowest[misled] = straight[misled], instead, 0.0, False
+            x[misled], costs[misled] = straight[misled], instead
         self.bends[sides] = (x - self.start) / far - self.ways[sides]
         of_drawn = self.drawn.cost(x) if self.drawn else np.full(len(sides), self.costs[0][0.0] + 0.5 * far**2)
         as_drawn = of_drawn - self.of_drawn[0][0.0] + self.costs[0][0.0] if self.drawn else of_drawn
-        costs = self.space.with_sampled_prior(x, costs)
+        costs, log_volume = self.space.with_sampled_prior(x, costs), np.where(lowest, log_volume, 0.0)
         costs = np.where(lowest, costs, np.minimum(costs, as_drawn))  # a higher J on the way is not that of x*
         for i, side in enumerate(sides):
             self.costs[side][far] = float(costs[i] - log_volume[i])
@@ -107,21 +109,30 @@ class _Walk:
         self.runs = self.runs.joined(ModelRuns.of(x, outcome, costs))
         return costs
 
-    def _lowest(self, emulated: EmulatedCost, x: Array, about: Array) -> tuple[Array, Array]:
-        """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
+    def _lowest(self, emulated: EmulatedCost, x: Array, about: Array) -> tuple[Array, Array, Mask]:
+        """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), ln V (S,), and whether none
+        about them is lower (S,).
+        """
 
         def costs(tried: Array) -> Array:
             x = tried.reshape(-1, tried.shape[-1])
             return self.space.with_sampled_prior(x, emulated.cost(x)).reshape(tried.shape[:-1])
 
-        def log_volume(at: Array) -> Array:
-            falls = costs(at)[:, None] - costs(at[:, None] + about)
+        def falls(at: Array) -> Array:
+            return np.asarray(costs(at)[:, None] - costs(at[:, None] + about))
+
+        def log_volume(falls: Array) -> Array:
             return np.asarray(np.logaddexp.reduce(falls + 0.5 * np.sum(self.normal**2, axis=1), axis=1))
 
         for width in WIDTHS:
-            tried = np.concatenate([x[:, None], x[:, None] + width * about], axis=1)
-            x = tried[np.arange(len(x)), np.argmin(costs(tried), axis=1)]
-        return x, log_volume(x) - log_volume(np.broadcast_to(self.start, x.shape))
+            for _ in range(AGAIN):
+                tried = np.concatenate([x[:, None], x[:, None] + width * about], axis=1)
+                lowest = np.argmin(costs(tried), axis=1)
+                x = tried[np.arange(len(x)), lowest]
+                if not lowest.any():
+                    break
+        at, at_start = falls(x), falls(np.broadcast_to(self.start, x.shape))
+        return x, log_volume(at) - log_volume(at_start), np.max(at, axis=1) < MISLED
 
     def rise(self, side: int, far: float) -> float:
         """Of J on a side, to where it was so far."""
@@ -183,8 +194,10 @@ def examine_ends(
         far *= FURTHER
         walk.go(left, far)
         left = walk.short(far, left)
-    if bent:  # how it rises there
-        walk.go(bent, END / 2)
+    for far in WITHIN:
+        if bent:  # how it rises there
+            walk.go(bent, far)
+            bent = [side for side in bent if walk.rise(side, far) > STEEP]
     quantiles, off = np.empty((len(QUANTILES), len(walk.start))), np.empty(len(walk.start))
     printed = diag.member_quantiles(prior.to_physical(ensemble), QUANTILES, axis=0)
     for j in range(len(off)):

@@ -81,8 +81,9 @@ def examine_shape(
             theta, names = space.problem.prior.to_physical(emulator.draws), space.problem.prior.names
             for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
                 numbers |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
-    scaled = any(walk.spread for walk in space.problem.walks)
-    return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, scaled)}
+    doubted = any(walk.spread for walk in space.problem.walks)
+    doubted |= bool(space.settings.own.approximate) and shape["gaussian_fit"] < CLEARED
+    return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, doubted)}
 
 
 def examine_tails(

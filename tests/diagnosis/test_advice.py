@@ -29,6 +29,7 @@ from estimation.test_agreement import joint
 from estimation.test_lost_frame import problem as filmed
 from toys import Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
 
+import en4dvar
 from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty.advice import ADVICE, Case
@@ -426,3 +427,21 @@ def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
 
 def test_every_code_of_the_catalogue_is_followed_somewhere():
     assert set(CATALOGUE) == {*PROVOKED, *OF_SEVERAL, "chain-not-converged"}
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_of_series_in_different_units_a_factor_of_their_errors_is_advised(factor):
+    """An error of the median of both, 10 m of 0.02 m and 20 W, was said to be stated."""
+    times, rng = np.linspace(0.5, 8, 16), np.random.default_rng(1)
+    head, power = (1.1 * np.exp(-0.3 * times) + factor * 0.02 * rng.standard_normal(16) for _ in range(2))
+    found = en4dvar.estimate(
+        lambda p, t: {"head": p["h"] * np.exp(-p["k"] * t), "power": 1000 * p["h"] * np.exp(-p["k"] * t)},
+        {"head": (times, head), "power": (times, 1000 * power)},
+        {"h": {"prior": "normal", "mean": "1 m", "std": "0.2 m"}, "k": "0.3 1/s"},
+        error={"head": "0.02 m", "power": "20 W"}, units={"h": "m", "k": "1/s", "head": "m", "power": "W", "time": "s"},
+        progress=False,
+    )  # fmt: skip
+    (told,) = (c for c in found.cautions if c.code in ("misfit", "overstated-error"))
+    advised = re.search(r"state errors about ([\d.]+) times as large", told.advice)
+    assert float(advised[1]) == pytest.approx(factor, rel=0.3)
+    assert "is stated" not in told.advice

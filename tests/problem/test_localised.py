@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Places, Series
+from en4dvar.diagnosis.honesty.advice import ADVICE, Case
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.joint.problem import sharing
 from en4dvar.model.forward import Observable, StateField
@@ -260,3 +261,18 @@ def test_what_cannot_be_localised():
         assimilate(line(), settings("es-mda", mda_form="square-root"), SEED)
     with pytest.raises(ConfigError, match="at least one parameter must be estimated"):
         assimilate(replace(line(), fields=()), settings(), SEED)
+
+
+class Bent(Line):
+    def step(self, x, t0, t1):
+        return np.append(x[:30] + 0.05 * (t1 - t0) * x[:30] ** 2, x[30])
+
+
+def test_what_is_advised_of_iterations_beside_a_localisation_is_read_there():
+    """Beyond 30 of them it was to set refine: mcmc, which is refused."""
+    found = assimilate(line(Bent()), settings(max_iterations=1), SEED)
+    (told,) = (c for c in found.cautions if c.code == "not-converged")
+    of_many = Case(replace(found, settings=settings(max_iterations=30)), told, frozenset({told.code}))
+    advice = ADVICE["not-converged"](of_many)
+    assert "refine" not in advice
+    assert "set assimilation.max_iterations: 60" in advice

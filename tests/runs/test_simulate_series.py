@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from en4dvar.config import load_config
 from en4dvar.config.document import read_document
 from en4dvar.config.kinds import resolve_campaign
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.units import UnitError
 from en4dvar.runs.simulation import draw_campaign, noise_level, simulate, to_csv, write_campaign
 
 YAML = """\
@@ -74,6 +76,13 @@ def test_noise_has_a_seed_and_a_std_of_each_series(tmp_path: Path) -> None:
     for std in (-0.1, {"p": 0.1}, np.nan):
         with pytest.raises(ConfigError, match="std: give one for all series, or of each: p, q, well"):
             found.with_noise(std, 1)
+
+
+def test_noise_in_the_unit_of_one_series_says_what_is_of_each(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path))
+    words = "--noise of p: '2 cm': unit 'cm' cannot be converted to '1'; of several series, '1 % of maximum' is of each"
+    with pytest.raises(UnitError, match=re.escape(words)):
+        noise_level("2 cm", config, simulate(config))
 
 
 def test_noise_is_a_share_of_each_series(tmp_path: Path) -> None:

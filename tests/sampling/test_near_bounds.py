@@ -91,3 +91,26 @@ def test_of_a_model_that_bends_there_the_better_ensemble_is_taken(seed):
     y = 0.25 * TIMES + 0.05 * np.random.default_rng(seed).standard_normal(12)
     found = estimated(lambda p, t: p["k"] ** 2 * t, y, {"prior": "half-normal", "std": 1}, seed, 0.05)
     assert found.posterior["k"].values.mean() == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.slow)])
+def test_ends_of_a_valley_that_is_bent_to_a_bound_are_those_of_quadrature(seed):
+    """The valley a phi² = 1.5 was said to reach a = 5 or 19: lowest J was not found beside it."""
+    times = np.linspace(0.2, 6, 15)
+    y = 1.5 * times + 0.3 * np.random.default_rng(seed).standard_normal(15)
+    scores, phi = np.linspace(-4, 4, 801), np.linspace(0, 1, 802)[1:-1]
+    a = np.exp(0.3 * scores)
+    cost = 0.5 * (y @ y - 2 * (of := a[:, None] * phi**2) * (y @ times) + of**2 * (times @ times)) / 0.09
+    shares = np.sum(np.exp(-cost + cost.min() - 0.5 * scores[:, None] ** 2) * phi * (1 - phi), axis=1)
+    ends = np.interp([0.05, 0.95], np.cumsum(shares) / shares.sum(), a)
+    priors = {
+        "a": {"prior": "lognormal", "median": 1, "log_std": 0.3},
+        "phi": {"prior": "beta", "lower": 0, "upper": 1, "alpha": 2, "beta": 2},
+    }
+    found = en4dvar.estimate(
+        lambda p, t: p["a"] * p["phi"] ** 2 * t, (times, y), priors, error=0.3, seed=1, progress=False
+    )
+    (row,) = (row for row in found.rows if row.name == "a")
+    said = found.sample_stats.attrs
+    told = [said.get("tail_q05_a", row.q05), said.get("tail_q95_a", row.q95)]
+    assert told == pytest.approx(ends, abs=0.4 * row.std)

@@ -321,3 +321,16 @@ def test_a_scheme_that_is_not_the_posterior_is_not_called_non_gaussian():
     (said,) = (w for w in found.warnings if "effective share" in w)
     assert "half of the gain" in said
     assert "far from Gaussian" not in said
+
+
+def test_a_scheme_whose_ensemble_is_twice_as_wide_says_so():
+    """Of two parameters, one known ten times as well as before; the effective share of the members is above a half."""
+    t = np.arange(1.0)
+    found = en4dvar.estimate(
+        lambda p, t: p["a"] + 0 * t, (t, 1 + t), {"a": {"prior": "normal", "mean": 0, "std": 1}},
+        error=0.25, progress=False, assimilation={"scheme": "denkf"},
+    )  # fmt: skip
+    exact = 1 / np.sqrt(1 + 1 / 0.25**2)
+    assert found.posterior["a"].values.std(ddof=1) > 1.3 * exact
+    assert found.sample_stats.attrs["gaussian_fit"] > 0.5
+    assert "non-gaussian" in found.sample_stats.attrs["warning_codes"]

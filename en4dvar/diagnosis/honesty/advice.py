@@ -55,10 +55,19 @@ class Case:
         return float(np.median(self.a.own_std))
 
     @property
+    def rescaled(self) -> str:
+        """To state errors that scatter as much as the residuals do; of several series, in units of their own."""
+        if len(self.a.observations.parts) > 1:
+            return f"state errors about {self.scatter:.2g} times as large"
+        right, now = (self.reading(factor * self.stated) for factor in (self.scatter, 1.0))
+        return f"state an error of about {right} ({now} is stated)"
+
+    @property
     def absurd(self) -> bool:
         """Whether the stated error is larger than half of what the readings span: hardly an error, perhaps its unit."""
         span = float(np.ptp(self.a.observations.values))
-        return 0 < span < 2 * self.stated and self.scatter < SHARE
+        single = len(self.a.observations.parts) < 2
+        return single and 0 < span < 2 * self.stated and self.scatter < SHARE
 
     @property
     def may_be_robust(self) -> bool:
@@ -143,11 +152,13 @@ def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
 
 
 def _not_converged(case: Case) -> str:
+    sampled = case.a.settings.localisation is None  # by refine: mcmc, which is not read beside one
     if case.a.settings.own.minimiser is None:
-        return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J, or assimilation.refine: mcmc"
+        chain = ", or assimilation.refine: mcmc" if sampled else ""
+        return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J{chain}"
     little = "no action is needed if this step is small enough for you; else " * (case.caution.severity == "note")
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
-    if now < ENOUGH:
+    if now < ENOUGH or not sampled:
         return f"{little}set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
     unsure = "narrow the priors of the parameters that the data hardly constrain"
     return f"{little}set assimilation.refine: mcmc, which needs no minimum, or {unsure}"
@@ -175,25 +186,22 @@ def _misfit(case: Case) -> str:
         return _structure(case)
     if "odd-residuals" in case.codes and case.may_be_robust:
         return "see the advice about single readings; look at the residuals before a larger error is stated"
-    larger = (
-        f"state an error of about {case.reading(case.scatter * case.stated)} ({case.reading(case.stated)} is stated)"
-    )
     return (
-        f"look at the residuals; if the readings scatter as much as they do, {larger}, or {case.with_scheme(SIGMA)}; "
-        "if not, the model or the window must change"
+        f"look at the residuals; if the readings scatter as much as they do, {case.rescaled}, or "
+        f"{case.with_scheme(SIGMA)}; if not, the model or the window must change"
     )
 
 
 def _overstated(case: Case) -> str:
-    scatter = case.reading(case.scatter * case.stated)
     if case.absurd:
+        scatter = case.reading(case.scatter * case.stated)
         return (
             f"check the unit of data.error: {case.reading(case.stated)} is stated, the residuals scatter by {scatter}"
         )
     if "residual-structure" in case.codes and not case.a.problem.discrepancy:
         return case.structure
     also = "" if NOISE_SCALE.name in case.a.problem.prior.names else f", or {case.with_scheme(SIGMA)}"
-    return f"state an error of about {scatter} ({case.reading(case.stated)} is stated){also}; intervals are too wide"
+    return f"{case.rescaled}{also}; intervals are too wide"
 
 
 def _structure(case: Case) -> str:
