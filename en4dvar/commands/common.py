@@ -175,12 +175,16 @@ def ask(question: str) -> bool:
 tell = functools.partial(echo, err=True)  # which step is being done
 
 
-def refuse_to_replace(force: bool, *outs: Path | None) -> None:
-    """Raise :class:`OutputError` where one of ``outs`` exists and is not to be replaced, or is the same as another."""
+def refuse_to_replace(force: bool, *outs: Path | None, read: Iterable[str | Path | None] = ()) -> None:
+    """Raise :class:`OutputError` where one of ``outs`` exists and is not to be replaced, is the same as another, or is
+    what is ``read``: readings, a movie or a result, which nobody can make again, are lost otherwise.
+    """
     from en4dvar.plumbing.errors import OutputError
 
-    places = set()
+    sources, places = {os.path.realpath(path) for path in read if path}, set()
     for out in filter(None, outs):
+        if os.path.realpath(out) in sources:
+            raise OutputError(f"{out}: is what the command reads, and is not replaced; give another name")
         if out.exists() and not force:
             raise OutputError(f"{out}: exists; give --force to replace it")
         if (place := os.path.realpath(out)) in places:
@@ -188,11 +192,13 @@ def refuse_to_replace(force: bool, *outs: Path | None) -> None:
         places.add(place)
 
 
-def deliver(text: str, out: Path | None, what: str, force: bool = True) -> None:
-    """Write to the file ``out`` and say ``what`` is there, or print. Raises :class:`OutputError`."""
+def deliver(text: str, out: Path | None, what: str, force: bool = True, read: Iterable[Path] = ()) -> None:
+    """Write to the file ``out``, which is none that was ``read``, and say ``what`` is there, or print. Raises
+    :class:`OutputError`.
+    """
     from en4dvar.plumbing.files import write_text
 
-    refuse_to_replace(force, out)
+    refuse_to_replace(force, out, read=read)
     if out is None:
         click.echo(text, nl=False)
     elif what:

@@ -211,13 +211,14 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
         known = ("is netCDF", "xarray.open_dataset") if cycles else ("follows the ArviZ schema", "arviz.from_netcdf")
         echo(f"{path} {known[0]} as it is: {known[1]}({str(path)!r}); nothing to export")
         return
+    results = [path for suffix in ("nc", "pack") for path in run_dir.glob(f"*.{suffix}")]
     try:
         text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
     except LackingError as error:
         if isinstance(error.rest, str):
-            deliver(error.rest, out, "table", force)
+            deliver(error.rest, out, "table", force, results)
         raise
-    deliver(text, out, "table", force)
+    deliver(text, out, "table", force, results)
 
 
 @click.command()
