@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from en4dvar.commands.common import Failed, give_up_output, printable, to_continue
+from en4dvar.commands.common import Failed, give_up_output, printable, require_words, to_continue
 from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
 from en4dvar.commands.results import compare, export, joint, population, report, rerun
 from en4dvar.commands.run import run, validate
@@ -55,6 +55,11 @@ class Commands(click.Group):
             return super().make_context(*args, **options)
         except KeyboardInterrupt:
             raise Failed("interrupted", 130) from None
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not ctx.resilient_parsing:  # as a shell that completes a line
+            require_words(args)
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         output = _output()

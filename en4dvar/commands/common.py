@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import re
 import shlex
@@ -111,11 +112,22 @@ def folder_of(kind: str, run_dirs: Sequence[Path]) -> Path:
     return inside(run_dirs[0].absolute().parent, f"{kind}_{named}"[:LONGEST])
 
 
-def not_empty(_: click.Context, __: click.Parameter, text: str | None) -> str | None:
-    """A value as it was given. Raises :class:`click.BadParameter` for none, which would be as if it had not been."""
-    if text == "":
-        raise click.BadParameter("nothing is given; is a variable of the shell not set, or did a command in it fail?")
-    return text
+def require_words(words: Sequence[str]) -> None:
+    """Raise :class:`click.UsageError` for an empty word, which would be as if it had not been given, or a folder."""
+    for before, word in zip(("", *words), words, strict=False):
+        if re.fullmatch(r"(--[\w-]+=)?", word):
+            why = "nothing is given; is a variable of the shell not set, or did a command in it fail?"
+            raise click.UsageError(f"{word or before}: {why}" if word or before else why)
+
+
+class Number(click.FloatRange):
+    """A finite number in a range: what is not a number compares as if it were within."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
 
 
 def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -124,9 +136,8 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @click.argument("config", type=click.Path(path_type=Path))
     @click.argument("more", nargs=-1, metavar="")
     @click.option(
-        "--data", metavar="FILE", type=click.Path(), callback=not_empty,
-        help="Data file, folder or pattern instead of data.path.",
-    )  # fmt: skip
+        "--data", metavar="FILE", type=click.Path(), help="Data file, folder or pattern instead of data.path."
+    )
     @click.option(
         "--set",
         "settings",
@@ -141,7 +152,7 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
         if more:  # what a shell makes of a pattern
             raise click.UsageError(
                 f"{more[0]}: there is one configuration; many data files are named by --data 'FOLDER/*.csv' (a folder, "
-                "or a pattern in quotes)"
+                "or a pattern in quotes), and a value with spaces stands in quotes"
             )
         return command(Source(config, data, settings), **options)
 
@@ -164,19 +175,30 @@ def ask(question: str) -> bool:
 tell = functools.partial(echo, err=True)  # which step is being done
 
 
-def refuse_to_replace(out: Path | None, force: bool) -> None:
-    """Raise :class:`OutputError` where ``out`` exists and is not to be replaced."""
+def refuse_to_replace(force: bool, *outs: Path | None, read: Iterable[str | Path | None] = ()) -> None:
+    """Raise :class:`OutputError` where one of ``outs`` exists and is not to be replaced, is the same as another, or is
+    what is ``read``: readings, a movie or a result, which nobody can make again, are lost otherwise.
+    """
     from en4dvar.plumbing.errors import OutputError
 
-    if out is not None and out.exists() and not force:
-        raise OutputError(f"{out}: exists; give --force to replace it")
+    sources, places = {os.path.realpath(path) for path in read if path}, set()
+    for out in filter(None, outs):
+        if os.path.realpath(out) in sources:
+            raise OutputError(f"{out}: is what the command reads, and is not replaced; give another name")
+        if out.exists() and not force:
+            raise OutputError(f"{out}: exists; give --force to replace it")
+        if (place := os.path.realpath(out)) in places:
+            raise OutputError(f"{out}: is to hold two things; give one of them another name")
+        places.add(place)
 
 
-def deliver(text: str, out: Path | None, what: str, force: bool = True) -> None:
-    """Write to the file ``out`` and say ``what`` is there, or print. Raises :class:`OutputError`."""
+def deliver(text: str, out: Path | None, what: str, force: bool = True, read: Iterable[Path] = ()) -> None:
+    """Write to the file ``out``, which is none that was ``read``, and say ``what`` is there, or print. Raises
+    :class:`OutputError`.
+    """
     from en4dvar.plumbing.files import write_text
 
-    refuse_to_replace(out, force)
+    refuse_to_replace(force, out, read=read)
     if out is None:
         click.echo(text, nl=False)
     elif what:

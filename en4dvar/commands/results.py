@@ -14,6 +14,7 @@ import click
 
 from en4dvar.commands.common import (
     Failed,
+    Number,
     ask,
     continuable,
     deliver,
@@ -210,13 +211,14 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
         known = ("is netCDF", "xarray.open_dataset") if cycles else ("follows the ArviZ schema", "arviz.from_netcdf")
         echo(f"{path} {known[0]} as it is: {known[1]}({str(path)!r}); nothing to export")
         return
+    results = [path for suffix in ("nc", "pack") for path in run_dir.glob(f"*.{suffix}")]
     try:
         text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
     except LackingError as error:
         if isinstance(error.rest, str):
-            deliver(error.rest, out, "table", force)
+            deliver(error.rest, out, "table", force, results)
         raise
-    deliver(text, out, "table", force)
+    deliver(text, out, "table", force, results)
 
 
 @click.command()
@@ -318,15 +320,15 @@ def joint(
     help="A parameter that varies from data set to data set about a common mean, e.g. G; any number of times.",
 )  # fmt: skip
 @click.option(
-    "--mean-std", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 1",
+    "--mean-std", type=Number(min=0, min_open=True), show_default="as in the run's population:, or 1",
     help="Hyperprior of the mean: normal about the prior's mean; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
-    "--spread", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 0.5",
+    "--spread", type=Number(min=0, min_open=True), show_default="as in the run's population:, or 0.5",
     help="Hyperprior of the spread: half-normal; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
-    "--odd", type=click.FloatRange(min=0, max=1, max_open=True), show_default="as in the run's population:, or 0.05",
+    "--odd", type=Number(min=0, max=1, max_open=True), show_default="as in the run's population:, or 0.05",
     help="Probability that a data set is odd, i.e. of another population, in all parameters or in one.",
 )  # fmt: skip
 @several_runs

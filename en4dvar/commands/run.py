@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, not_empty, workers_option
+from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, workers_option
 from en4dvar.plumbing.hints import counted
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ MOST_NAMED = 3  # data sets of a warning
 @click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
 @click.option("--with-what-if", is_flag=True, help="Widen the intervals by the assumptions of the what-if table.")
 @workers_option
-@click.option(
-    "--scheduler", metavar="ADDRESS", callback=not_empty, help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786."
-)
+@click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(source: Source, force: bool, resume: bool, workers: int | None, scheduler: str | None, **asked: Any) -> None:
     """Estimate the parameters; write posterior and report.
 

@@ -59,8 +59,7 @@ def simulate(
         echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
         return
     config = source.load()
-    for path in (out, *(path for _, path, _ in others.values())):
-        refuse_to_replace(path, force)
+    refuse_to_replace(force, out, *(path for _, path, _ in others.values()), read=[source.path])
     instants = parse_times(times, config.model.time_unit) if times else None
     seed = config.seed if seed is None else seed
     for name, (entry, path, settings) in others.items():
@@ -168,6 +167,8 @@ def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) 
     from en4dvar.runs.twin_sweep import sweep_twin as sweep
 
     vary = parted(varied, "--vary")
+    if len(vary) < len(varied):
+        raise click.UsageError("--vary: give all values of a key in one list")
     how |= {"overrides": source.overrides(), "progress": lambda done, of: tell(f"{done} of {of} runs")}
     with continuable(how["out"], how["resume"]) as command:
         result = sweep(source.path, vary, seeds, command=command, **how)

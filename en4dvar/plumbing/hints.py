@@ -136,7 +136,7 @@ def listed(names: Iterable[str], most: int = 30) -> str:
 def beside(path: Path) -> str:
     """``"no such file"`` and what lies in its place: similar names, else files of the same kind."""
     try:
-        names = sorted(p.name for p in path.parent.iterdir() if p.is_file())
+        names = sorted(p.name for p in path.parent.iterdir() if p.is_file() and not p.name.startswith("."))
     except OSError:
         return brief(f"no such file; the folder {path.parent} cannot be read")
     close = get_close_matches(path.name, names, 3, 0.6) or [b for b in names if Path(b).suffix == path.suffix][:5]

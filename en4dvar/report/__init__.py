@@ -5,7 +5,7 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
@@ -56,6 +56,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     stored = RunResults(run_dir)
     if stored.files == [stored.whole]:
         result = load_stored(stored.whole)
+        _require_known(run_dir, datasets, [result.name])
         write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
         folder = inside(run_dir, "figures") if files else None
@@ -68,14 +69,18 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
         stored.require()
     _write_tables(run_dir, lines)
     stems = {s.name: s.stem for s in sets}
-    for name in datasets:
-        if name not in stems:
-            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
+    _require_known(run_dir, datasets, stems)
     failures = failed_datasets(stored.whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
     page = _write_campaign(run_dir, sets, failures, {stems[name] for name in datasets}, workers, files)
     stored.require(page)
     return page
+
+
+def _require_known(run_dir: Path, names: Sequence[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, known)}")
 
 
 def _lines(result: StoredResult) -> list[list[Line]]:

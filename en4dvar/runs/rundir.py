@@ -186,7 +186,8 @@ def _prepare(path: Path, mode: Mode) -> Path:
 
 def _occupied(path: Path, listed: Sequence[str]) -> str:
     """What is in the directory, and what can be typed."""
-    beside = next(p for i in itertools.count(2) if not (p := path.with_name(f"{path.name}_{i}")).exists())
+    named = path if path.name not in ("", "..") else path.resolve()
+    beside = next(p for i in itertools.count(2) if not (p := named.parent / f"{named.name or 'run'}_{i}").exists())
     another = f"--out {shlex.quote(str(beside))} keeps both"
     if not listed:
         return f"{path}: not empty, and not of a run; {another}"

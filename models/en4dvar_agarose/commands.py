@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Source, continuable, note_beginning
+from en4dvar.commands.common import Number, Source, continuable, note_beginning
 
 
 @click.command()
@@ -17,7 +17,11 @@ from en4dvar.commands.common import Source, continuable, note_beginning
 @click.option("--shift", default="0.8 us", show_default=True, help="Largest time shift.")
 @click.option("--step", default="0.025 us", show_default=True, help="Step of the time grid and of the shifts.")
 @click.option(
-    "--width", type=float, default=3.0, show_default=True, help="Range searched, in prior standard deviations."
+    "--width",
+    type=Number(min=0, min_open=True),
+    default=3.0,
+    show_default=True,
+    help="Range searched, in prior standard deviations.",
 )
 @click.option("--refine", type=click.IntRange(min=0), default=0, show_default=True, help="Rounds of local refinement.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; default runs/<name>_sweep.")
@@ -53,9 +57,9 @@ def sweep(
     try:
         within, grid = (parse_quantity(text, problems[0].model.time_unit) for text in (shift, step))
     except UnitError as error:
-        raise click.UsageError(str(error)) from None
-    if within < 0 or grid <= 0 or not width > 0:
-        raise click.UsageError("--shift must not be negative, --step and --width must be positive")
+        raise click.UsageError(f"--shift {shift}, --step {step}: {error}") from None
+    if within < 0 or grid <= 0:
+        raise click.UsageError("--shift must not be negative, and --step must be positive")
     chosen = SweepSettings(trajectories, within, grid, width, rounds=refine)
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     who = identity_of(loaded[0].seed, chosen, {f"{i} {config.name}": config for i, config in enumerate(loaded, 1)})

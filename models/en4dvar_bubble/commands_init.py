@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import click
 
-from en4dvar.commands.common import Failed, command_line, echo, from_here
+from en4dvar.commands.common import Failed, command_line, echo, from_here, refuse_to_replace
 from en4dvar.inputs.formats import Disorder, Format, Repeated
 from en4dvar.plumbing.errors import En4dvarError, OutputError, retold
 from en4dvar_bubble.commands import completed_law
@@ -121,6 +121,7 @@ def init(
     name = run_name(str(out or data or movie or "bubble"))  # a file that is called my_gel is run as my_gel
     words = command_line()
     target = out or Path(f"{name}.yaml")
+    refuse_to_replace(True, target, read=[data, movie])
     if target.exists() and not force:
         raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
     if not target.absolute().parent.is_dir():

@@ -71,8 +71,7 @@ def track(
     if outlined:
         require_suffix(outlined)
     more = [table.with_name(f"{table.stem}_{n}{table.suffix}") for n in range(2, MOST + 1)] if choice["every"] else []
-    for target in (table, shown, outlined, *more):
-        refuse_to_replace(target, force)
+    refuse_to_replace(force, table, shown, outlined, *more, read=[movie, corrections, choice["mask"]])
     if out is None and (another := other_movie(table, movie)):
         raise OutputError(f"{table}: was read from {another} and is not replaced; give --out another name")
     fixed = read_corrections(corrections) if corrections else {}

@@ -21,6 +21,7 @@ def test_command(tmp_path):
     assert table[0] == "dataset,G (kPa),alpha,mu (Pa s),R0 (um),t_s (us),NRMSE"
     assert len(table) == 2
     assert isinstance(CliRunner().invoke(sweep_command, call).exception, OutputError)
+    assert CliRunner().invoke(sweep_command, [*call, "--width", "inf"]).exit_code == 2
     other = [*call, "--width", "2"]
     changed = CliRunner().invoke(sweep_command, [*other, "--resume"]).exception
     assert isinstance(changed, OutputError)

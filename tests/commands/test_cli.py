@@ -98,6 +98,25 @@ def test_report_again(tmp_path: Path) -> None:
     assert outcome.exit_code == 0
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
     assert call("report", tmp_path / "nowhere").exit_code == 2
+    unknown = call("report", tmp_path / "run", "--dataset", "toys")
+    assert unknown.exit_code == 2
+    assert "no data set 'toys'; did you mean 'toy'?" in unknown.stderr
+
+
+@pytest.mark.parametrize("out", [".", "..", "../.."])
+def test_a_folder_without_a_name_of_its_own_is_not_empty_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    within = tmp_path / "a" / "b"
+    within.mkdir(parents=True)
+    config = write_toy(within)
+    monkeypatch.chdir(within)
+    (tmp_path / "a" / "mine.txt").write_text("")
+    (tmp_path / "mine.txt").write_text("")
+    outcome = call("run", config, "--out", out)
+    assert outcome.exit_code == 2
+    folder = (within / out).resolve()
+    assert f"{out}: not empty, and not of a run; --out {folder.parent / folder.name}_2 keeps both" in outcome.stderr
 
 
 def test_validate_tells_what_would_be_estimated(tmp_path: Path) -> None:
@@ -196,6 +215,12 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "data as configuration": (lambda f: ["run", damaged(f / "A.mat")], "A.mat' looks at the readings and proposes one"),
     "readings as configuration": (lambda f: ["run", write_toy(f).with_suffix(".csv")], "toy.csv: a data file, not a"),
     "a folder as configuration": (lambda f: ["run", f], "a folder, not a configuration; 'en4dvar init --data "),
+    "no number": (lambda f: ["population", f, "--of", "k", "--spread", "nan"], "nan is not a finite number"),
+    "no finite number": (lambda f: ["population", f, "--of", "k", "--mean-std", "inf"], "inf is not a finite number"),
+    "a key varied twice": (
+        lambda f: ["sweep-twin", write_toy(f), "--vary", "a=[1]", "--vary", "a=[2]"],
+        "--vary: give all values of a key in one list",
+    ),
     "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
     "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
     "an unquoted pattern": (lambda f: ["run", write_toy(f), "--data", "a", "b"], "b: there is one configuration; many"),

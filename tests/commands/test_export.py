@@ -151,6 +151,10 @@ def test_files_and_faults(one: Path, tmp_path: Path) -> None:
     assert call(one, "--latex", "--out", out).output == f"table: {out}\n"
     assert out.read_text(encoding="utf-8") == export_table(one, "latex")
     assert (call(one, "--latex", "--out", out).exit_code, call(one, "--out", out, "--force").exit_code) == (2, 0)
+    kept = (one / "posterior.nc").read_bytes()
+    over = call(one, "--out", one / "posterior.nc", "--force")
+    assert (over.exit_code, "is what the command reads, and is not replaced" in over.stderr) == (2, True)
+    assert (one / "posterior.nc").read_bytes() == kept
     for flag in ("--csv", "--netcdf"):
         done = call(tmp_path / "nowhere", flag)
         assert (done.exit_code, done.stderr.count("no such file or directory")) == (2, 1)

@@ -64,6 +64,8 @@ def test_a_form_gets_what_the_command_was_given() -> None:
     [
         (["--poem-set", "a=1"], "--poem-set needs --poem FILE"),
         (["--poem", "p", "--poem-set", "a"], "'a' is not KEY=VALUE"),
+        (["--poem", "p", "--out", "./p"], "p: is to hold two things"),
+        (["--out", "rose.yaml", "--force"], "rose.yaml: is what the command reads"),
         (["--poem", "p", "--noise", "1 m"], "name its file with --out"),
         (["--gone", "p"], "cannot be loaded"),
     ],

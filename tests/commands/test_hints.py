@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from en4dvar.assembly.reading import find_files
-from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.hints import beside, suggest
 
 LAWS = {
     "fung-kelvin-voigt": "Fung exponential Kelvin–Voigt",
@@ -35,6 +35,12 @@ def test_a_name_is_found_by_its_parts_and_by_what_it_means(word: str, meant: str
 
 def test_what_nothing_resembles_is_answered_with_all_names() -> None:
     assert suggest("e", ["mu", "alpha"]) == "; known: mu, alpha"
+
+
+def test_hidden_files_are_not_offered(tmp_path: Path) -> None:
+    for name in (".listing", "notes"):
+        (tmp_path / name).write_text("")
+    assert beside(tmp_path / "zzz") == "no such file; the folder holds notes"
 
 
 def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

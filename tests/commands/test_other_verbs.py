@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from init_files import call
+from init_files import call, write
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 OTHERS = {  # file → the words that say which command it is for, and the commands that can do nothing with it
@@ -62,3 +62,15 @@ def test_a_run_in_place_of_a_configuration(tmp_path: Path) -> None:
     result = call("run", tmp_path)
     assert result.exit_code == 2
     assert "a folder, not a configuration; it holds config.resolved.yaml, config.yaml" in result.stderr
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_readings_are_not_replaced_by_what_is_proposed_for_them(tmp_path: Path) -> None:
+    data = write(tmp_path / "b.csv", "t_us,R_um")
+    held = data.read_bytes()
+    done = call("init", "--data", data, "--out", "b.csv", "--force")
+    assert (done.exit_code, done.stderr) == (
+        2,
+        "b.csv: is what the command reads, and is not replaced; give another name\n",
+    )
+    assert data.read_bytes() == held

@@ -129,6 +129,7 @@ def test_data_sets_without_a_population_are_reported_alone(tmp_path, monkeypatch
         (3, "population: {of: [q]}\n", r"yaml:\d+:\d+: population\.of\.0: q: not estimated"),
         (3, "population: {of: [c]}\n", r"yaml:\d+:\d+: population\.of\.0: c: not estimated"),
         (3, "population: {of: [A]}\n", r"A: its prior depends on the data set"),
+        (3, "population: {of: [k, k]}\n", r"population of k, k: name each parameter once"),
         (3, "population: {of: []}\n", r"yaml:\d+:\d+: population\.of: "),
         (3, "population: {of: [k], reference: {q: 2 N/m}}\n", r"yaml:\d+:\d+: population\.reference\.q: 'q': neither"),
         (3, "population: {of: [k], reference: {k: 2 ± 1 s}}\n", r"yaml:\d+:\d+: population\.reference\.k: '2 s'"),

@@ -51,8 +51,8 @@ def test_the_batch_script_computes_on_its_own_workers(tmp_path: Path) -> None:
     assert_same_results(run, tmp_path / "quiet")
 
 
-@pytest.mark.parametrize("option", ["--scheduler", "--data"])
+@pytest.mark.parametrize("option", ["--scheduler", "--data", "--out", "--out=", "--set"])
 def test_what_a_script_leaves_empty_is_not_as_if_it_had_not_been_given(tmp_path: Path, option: str) -> None:
-    done = CliRunner().invoke(main, ["run", str(make_campaign(tmp_path, 2)), option, ""])
+    done = CliRunner().invoke(main, ["run", str(make_campaign(tmp_path, 2)), option, *[""] * ("=" not in option)])
     assert done.exit_code == 2
     assert "nothing is given; is a variable of the shell not set" in done.stderr

@@ -62,6 +62,16 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     np.testing.assert_allclose([offset.mean, offset.std], [0, 1e-6 * PIXEL * edge], atol=1e-8)
 
 
+@pytest.mark.parametrize("option", ["--out", "--page", "--outlined"])
+def test_a_movie_is_not_replaced_by_what_is_read_from_it(tmp_path, monkeypatch, option):
+    tracked(tmp_path, monkeypatch, 4)
+    held = (tmp_path / "gel.tif").read_bytes()
+    outcome = CliRunner().invoke(main, ["track", "gel.tif", *SCALE, "--force", option, "gel.tif"])
+    assert outcome.exit_code == 2
+    assert "gel.tif: is what the command reads, and is not replaced; give another name" in outcome.output
+    assert (tmp_path / "gel.tif").read_bytes() == held
+
+
 @pytest.mark.parametrize(("factor", "words"), [(2e-5, 0), (3e-3, 1)])
 def test_a_lasting_shape_is_on_the_page_where_it_is_felt(factor, words):
     movie = movie_of(list(render(np.array([[20.0], [22.0]]), Scene(), np.random.default_rng(3))))

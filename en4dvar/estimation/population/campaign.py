@@ -189,6 +189,8 @@ def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[
 
 def require_population(problems: Sequence[InverseProblem], names: Sequence[str]) -> None:
     """Raises :class:`ConfigError`, see :func:`population_of`."""
+    if len(set(names)) < len(names):
+        raise ConfigError(f"population of {', '.join(names)}: name each parameter once")
     terms_of(problems, names)
     for name, what in itertools.product(names, (of.name for of in fields(Draws))):
         if (taken := f"{name}_{what}") in problems[0].constant.prior.names:  # a variable of its file
