@@ -324,7 +324,7 @@ def test_a_scheme_that_is_not_the_posterior_is_not_called_non_gaussian():
 
 
 def test_a_scheme_whose_ensemble_is_twice_as_wide_says_so():
-    """Of two parameters, one known ten times as well as before; the effective share of the members is above a half."""
+    """A parameter that is known four times as well as before; the effective share of the members is above a half."""
     t = np.arange(1.0)
     found = en4dvar.estimate(
         lambda p, t: p["a"] + 0 * t, (t, 1 + t), {"a": {"prior": "normal", "mean": 0, "std": 1}},

@@ -261,14 +261,9 @@ def _delays(readings: Mapping[str, Readings], source: Source) -> tuple[dict[str,
     """The scalar that every file states of its trigger, with its unit, and its value (s) in each; none where a reading
     lies before it, or several bubbles' tops agree better without it.
     """
-    names = {
-        name for series in readings.values() for name in series.scalars if _DELAY.fullmatch(without_unit(name, "s"))
-    }
-    if (
-        len(names) != 1
-        or source.time is None
-        or not all(names <= series.scalars.keys() for series in readings.values())
-    ):
+    scalars = [series.scalars.keys() for series in readings.values()]
+    names = {name for of_file in scalars for name in of_file if _DELAY.fullmatch(without_unit(name, "s"))}
+    if len(names) != 1 or source.time is None or not all(names <= of_file for of_file in scalars):
         return {}, {}
     (name,) = names
     unit = unit_in(name, "s") or source.time[1]
@@ -288,8 +283,9 @@ def _with_delay(proposal: Proposal, delay: Mapping[str, str]) -> Proposal:
         plus = None if line.value == "file" else line.value
         return replace(line, value=braced(**delay, plus=plus), comment=words)
 
-    asked = bool(delay)
-    lines = [with_it(it) if asked and it.key == "time_zero" and it.value != "top" else it for it in proposal.data]
+    if not delay:
+        return proposal
+    lines = [with_it(it) if it.key == "time_zero" and it.value != "top" else it for it in proposal.data]
     return replace(proposal, data=tuple(lines))
 
 
