@@ -175,15 +175,22 @@ def ask(question: str) -> bool:
 tell = functools.partial(echo, err=True)  # which step is being done
 
 
-def refuse_to_replace(force: bool, *outs: Path | None, read: Iterable[str | Path | None] = ()) -> None:
+def refuse_to_replace(force: bool, *outs: Path | None, read: Sequence[str | Path | None] = ()) -> None:
     """Raise :class:`OutputError` where one of ``outs`` exists and is not to be replaced, is the same as another, or is
-    what is ``read``: readings, a movie or a result, which nobody can make again, are lost otherwise.
+    what is ``read``: readings, a movie or a result, which nobody can make again, are lost otherwise. A text stands for
+    data files, as ``data.path`` does.
     """
-    from en4dvar.plumbing.errors import OutputError
+    from en4dvar.plumbing.errors import DataError, OutputError
 
-    sources, places = {os.path.realpath(path) for path in read if path}, set()
+    sources, places = {os.path.realpath(path) for path in read if isinstance(path, Path)}, set()
+    there = any(out.exists() for out in outs if out)
+    for text in dict.fromkeys(text for text in read if there and isinstance(text, str)):
+        from en4dvar.assembly.reading import find_files
+
+        with suppress(DataError):
+            sources.update(map(os.path.realpath, find_files(Path(), [text]).values()))
     for out in filter(None, outs):
-        if os.path.realpath(out) in sources:
+        if there and os.path.realpath(out) in sources:
             raise OutputError(f"{out}: is what the command reads, and is not replaced; give another name")
         if out.exists() and not force:
             raise OutputError(f"{out}: exists; give --force to replace it")
@@ -192,7 +199,7 @@ def refuse_to_replace(force: bool, *outs: Path | None, read: Iterable[str | Path
         places.add(place)
 
 
-def deliver(text: str, out: Path | None, what: str, force: bool = True, read: Iterable[Path] = ()) -> None:
+def deliver(text: str, out: Path | None, what: str, force: bool = True, read: Sequence[Path] = ()) -> None:
     """Write to the file ``out``, which is none that was ``read``, and say ``what`` is there, or print. Raises
     :class:`OutputError`.
     """

@@ -59,7 +59,8 @@ def simulate(
         echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
         return
     config = source.load()
-    refuse_to_replace(force, out, *(path for _, path, _ in others.values()), read=[source.path])
+    data = [path for series in (config.data.series if config.data else ()) for path in series.data.path]
+    refuse_to_replace(force, out, *(path for _, path, _ in others.values()), read=[source.path, *data])
     instants = parse_times(times, config.model.time_unit) if times else None
     seed = config.seed if seed is None else seed
     for name, (entry, path, settings) in others.items():

@@ -58,7 +58,7 @@ def track(
     from en4dvar.runs.progress import counted
     from en4dvar_movie.choice import numbers, read_corrections, watched
     from en4dvar_movie.following import MOST
-    from en4dvar_movie.frames import open_movie, require_suffix, write_movie
+    from en4dvar_movie.frames import IMAGES, TIFF, open_movie, require_suffix, write_movie
     from en4dvar_movie.page import outlined as outlined_frames
     from en4dvar_movie.page import page_text
     from en4dvar_movie.table import other_movie, to_csv
@@ -71,7 +71,8 @@ def track(
     if outlined:
         require_suffix(outlined)
     more = [table.with_name(f"{table.stem}_{n}{table.suffix}") for n in range(2, MOST + 1)] if choice["every"] else []
-    refuse_to_replace(force, table, shown, outlined, *more, read=[movie, corrections, choice["mask"]])
+    frames = (p for p in movie.glob("*") if p.suffix.lower() in (*TIFF, *IMAGES))  # of a folder
+    refuse_to_replace(force, table, shown, outlined, *more, read=[movie, *frames, corrections, choice["mask"]])
     if out is None and (another := other_movie(table, movie)):
         raise OutputError(f"{table}: was read from {another} and is not replaced; give --out another name")
     fixed = read_corrections(corrections) if corrections else {}

@@ -72,6 +72,14 @@ def test_a_movie_is_not_replaced_by_what_is_read_from_it(tmp_path, monkeypatch, 
     assert (tmp_path / "gel.tif").read_bytes() == held
 
 
+def test_a_frame_of_a_folder_is_not_replaced_by_the_outlined_movie(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number in range(2):
+        tifffile.imwrite(tmp_path / f"{number}.tif", np.zeros((40, 40), dtype=np.uint8))
+    outcome = CliRunner().invoke(main, ["track", ".", *SCALE, "--force", "--outlined", "1.tif", "--out", "gel.csv"])
+    assert (outcome.exit_code, "1.tif: is what the command reads" in outcome.output) == (2, True)
+
+
 @pytest.mark.parametrize(("factor", "words"), [(2e-5, 0), (3e-3, 1)])
 def test_a_lasting_shape_is_on_the_page_where_it_is_felt(factor, words):
     movie = movie_of(list(render(np.array([[20.0], [22.0]]), Scene(), np.random.default_rng(3))))
