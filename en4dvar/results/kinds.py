@@ -29,8 +29,11 @@ def kind_named(name: str) -> Any:
 
 def kind_in(folder: Path) -> Any:
     """The kind of the finished run in ``folder``; that of an estimate where there is no result of another kind."""
-    kinds = map(kind_named, KINDS)  # that of an estimate first
-    return next((kind for kind in kinds if (folder / kind.result).is_file()), kind_named("estimate"))
+    for kind in map(kind_named, KINDS):  # that of an estimate first
+        tables = kind.files if kind.result.endswith(".csv") else ()  # another's sweep.csv stands alone
+        if all((folder / name).is_file() for name in (kind.result, *tables) if "/" not in name):
+            return kind
+    return kind_named("estimate")
 
 
 def require_no_other(folder: Path) -> None:
@@ -42,8 +45,6 @@ def require_no_other(folder: Path) -> None:
         require_result(folder)
         return
     tables = [str(folder / name) for name in (*kind.files, *kind.pages) if name.endswith(".csv")]
-    if not all((folder / name).is_file() for name in kind.files if name.endswith(".csv")):  # another's sweep.csv
-        return
     where = f"; its numbers are in {' and '.join(tables)}" if tables else ""
     read = f"; it is read by {listed(f'en4dvar {command}' for command in kind.readers)}" if kind.readers else ""
     raise OutputError(f"{folder}: holds a run of the kind {kind.name}, and no posterior.nc of an estimate{where}{read}")

@@ -64,6 +64,8 @@ class Kind:
         """
         if not cls.writer:
             return None
+        if datasets:
+            raise OutputError(f"--dataset {datasets[0]}: a run of the kind {cls.name} has one page, of all it holds")
         told = (figures,) if {*FIGURES} <= {*cls.pages} else ()
         with understood(folder / cls.result):
             page: Path = resolve_name(cls.writer)(folder, *told)

@@ -34,6 +34,7 @@ PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a 
 LOG = "run.log"
 OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
+ENDS = ("calibration.csv", "sweep.csv")  # a run ends with one of these, or with netCDF
 BESIDE = re.compile(r"data(\..+)?\.csv")  # these, and further arrays
 Mode = Literal["new", "force", "resume", "report", "beside"]
 
@@ -81,6 +82,10 @@ class RunDirectory:
                 elif not resumed:
                     directory._refuse_foreign((*OF_EVERY_RUN, *files))
                     write_list(directory.work, ())
+                elif mode == "resume" and not {*files}.intersection(lines_of_list(work)):
+                    for name in lines_of_list(work):
+                        if not (name in OF_EVERY_RUN or "/" in name or BESIDE.fullmatch(name)):
+                            raise OutputError(f"{path}: holds {name} of another command; give another --out")
             try:
                 yield directory
             except BaseException as error:
@@ -191,13 +196,12 @@ def _occupied(path: Path, listed: Sequence[str]) -> str:
     another = f"--out {shlex.quote(str(beside))} keeps both"
     if not listed:
         return f"{path}: not empty, and not of a run; {another}"
-    results = [path / name for name in listed if "/" not in name and name.endswith(".nc")]  # written as a run ends
-    ended = [file.stat().st_mtime for file in results if file.is_file()]
+    held = [path / name for name in listed if "/" not in name and (path / name).is_file()]
+    ended = [file.stat().st_mtime for file in held if file.suffix == ".nc" or file.name in ENDS]
     if not ended or (path / NEXT / LISTING).exists():
         return f"{path}: not empty: a run; --resume continues it if it has not ended, --force replaces it, {another}"
     when = datetime.fromtimestamp(max(ended)).strftime("%Y-%m-%d %H:%M")
-    page = path / "report.html"
-    to_read = f", see {page}" if page.is_file() else ""
+    to_read = next((f", see {file}" for file in held if file.suffix == ".html"), "")
     return f"{path}: not empty: a finished run of {when}{to_read}; --force replaces it, {another}"
 
 

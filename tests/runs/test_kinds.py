@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -94,6 +95,15 @@ def test_what_is_written_is_declared(
     if kind_named(name).pages:
         page = call(prepared, "report", out)
         assert page.exit_code == 0, page.output
+    if name != "estimate" and kind_named(name).pages:
+        assert "has one page, of all it holds" in call(prepared, "report", out, "--dataset", "set1").stderr
+    if name not in IN_PLACE:
+        again = call(prepared, *WORKED[name], "--out", out)
+        assert f"not empty: a finished run of {datetime.now():%Y-}" in again.stderr
+        assert kind_named(name).writer == "" or f", see {out}/" in again.stderr
+        other = next(words for words in WORKED.values() if words[0] != WORKED[name][0])
+        told = call(prepared, *other, "--out", out, "--resume")
+        assert (told.exit_code, "of another command; give another --out" in told.stderr) == (2, True)
     if name in ("twin", "joint"):  # the directory is the same for all
         again = call(prepared, *WORKED[name], "--out", out, *([] if name in IN_PLACE else ["--force"]))
         assert again.exit_code == 0, again.output
