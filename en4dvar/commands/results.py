@@ -52,7 +52,8 @@ def _medians(texts: Sequence[str]) -> Known:
         name, _, value = rest.partition("=")
         if not (run and name and value):
             raise click.BadParameter(f"{text!r} is no median such as 'gel_5:G=5.1 ± 0.2 kPa'")
-        medians.setdefault(run, {})[name.strip()] = value.strip()
+        if medians.setdefault(run, {}).setdefault(name.strip(), value.strip()) != value.strip():
+            raise click.BadParameter(f"{run}:{name.strip()} is given two values")
     return medians
 
 

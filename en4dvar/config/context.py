@@ -34,6 +34,8 @@ _MESSAGES = {
     "string_type": "expected text; put it in quotes",
     "path_type": "expected the path of a file or folder",
     "int_parsing_size": "too large for a whole number",
+    r"^\w+://\S+$": "expected an address such as tcp://10.0.0.1:8786",
+    r"^\w[\w.+ -]*$": "expected letters, digits, blanks and . + - _, a letter or digit first",
 }
 
 
@@ -160,7 +162,7 @@ def _message(item: Any) -> str:
         return _not_one_of(item["input"], context["expected"].replace(" or ", ", "))
     if kind == "too_short":
         return f"give at least {context['min_length']}, not {shown(item['input'])}"
-    message = _MESSAGES.get(kind, item["msg"].replace("Input should be", "should be"))
+    message = _MESSAGES.get(context.get("pattern", kind), item["msg"].replace("Input should be", "should be"))
     return message if kind == "missing" else f"{message}{_NOT}{shown(item['input'])}"
 
 

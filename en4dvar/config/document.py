@@ -29,6 +29,7 @@ Source = str | Path | Mapping[str, Any]  # of a configuration
 
 LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
 
+OPTIONS = {"data.path": "--data", "execution.address": "--scheduler"}  # keys that a command has an option for
 NULL = "a null byte, which no name, word or number holds"
 _INT = re.compile(r"[-+]?\d{1,40}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
@@ -186,9 +187,8 @@ def override(
     origins = dict(document.origins)
     faults: list[Fault] = []
     for dotted, value in overrides.items():
-        path, origin = tuple(dotted.split(".")), (places or {}).get(dotted, f"{option} {dotted}")
-        if (dotted, option) == ("data.path", "--set"):
-            origin = "--data"
+        own = OPTIONS.get(dotted) if option == "--set" else None
+        path, origin = tuple(dotted.split(".")), (places or {}).get(dotted, own or f"{option} {dotted}")
         if isinstance(value, str):
             value = _read(Document({}, origin, value), faults)
         node = data

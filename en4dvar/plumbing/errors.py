@@ -26,7 +26,7 @@ class Fault:
 
     def __str__(self) -> str:
         where = ":".join(str(part) for part in (self.file, self.line, self.column) if part)
-        path = "" if where.partition(" ")[2] == self.path else self.path
+        path = "" if where.startswith("--") and where.partition(" ")[2] in ("", self.path) else self.path
         return ": ".join(part for part in (where, path, self.message) if part)
 
 

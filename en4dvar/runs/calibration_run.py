@@ -39,6 +39,7 @@ from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run, 
 STATE = f"{FOLDER}/calibration"
 ATTEMPTS = 100  # truths that the model cannot run are drawn again so often
 FEWEST = 2
+NOT_OF_READINGS = ("name", "seed", "assimilation", "execution", "output", "population", "design", "simulate")
 
 
 def calibrate(
@@ -71,6 +72,8 @@ def calibrate(
     own = load_config(config, overrides)
     made, changed = own, ""
     if made_with:
+        if idle := [key for key in made_with if key.split(".")[0] in NOT_OF_READINGS]:
+            raise ConfigError(f"--made-with {idle[0]}: has no part in making readings; --set changes it")
         document, base = document_from(config, overrides)
         made = resolve(override(document, made_with, "--made-with"), base)
         changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}})

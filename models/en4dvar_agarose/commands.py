@@ -1,5 +1,6 @@
 """``en4dvar sweep`` and ``en4dvar study``. Heavy imports stay inside the commands."""
 
+import os
 from pathlib import Path
 
 import click
@@ -52,6 +53,8 @@ def sweep(
     from en4dvar_agarose.run import StudyCheckpoints, earliest_reading, identity_of, one_model
     from en4dvar_agarose.tables import sweep_csv, sweep_text
 
+    if len({*map(os.path.realpath, configs)}) < len(configs):
+        raise click.UsageError("the same configuration is given twice, and its data sets would count twice")
     loaded = [Source(Path(config), data, settings).load() for config in configs]
     problems = one_model([problem for config in loaded for problem in build(config)])
     try:

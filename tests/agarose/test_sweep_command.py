@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
+import en4dvar
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar_agarose.commands import sweep as sweep_command
 
@@ -17,6 +19,9 @@ def test_command(tmp_path):
     first = CliRunner().invoke(sweep_command, call)
     assert first.exit_code == 0, first.output
     assert "NRMSE" in first.output
+    assert "given twice" in CliRunner().invoke(sweep_command, [call[0], *call]).output
+    with pytest.raises(OutputError, match=r"holds sweep\.csv of another command; give another --out"):
+        en4dvar.run(call[0], overrides={"output.directory": str(tmp_path)}, resume=True)
     table = (tmp_path / "sweep.csv").read_text().splitlines()
     assert table[0] == "dataset,G (kPa),alpha,mu (Pa s),R0 (um),t_s (us),NRMSE"
     assert len(table) == 2

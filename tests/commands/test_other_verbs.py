@@ -68,9 +68,19 @@ def test_a_run_in_place_of_a_configuration(tmp_path: Path) -> None:
 def test_readings_are_not_replaced_by_what_is_proposed_for_them(tmp_path: Path) -> None:
     data = write(tmp_path / "b.csv", "t_us,R_um")
     held = data.read_bytes()
-    done = call("init", "--data", data, "--out", "b.csv", "--force")
-    assert (done.exit_code, done.stderr) == (
-        2,
-        "b.csv: is what the command reads, and is not replaced; give another name\n",
+    config = tmp_path / "b.yaml"
+    config.write_text(
+        (CONFIGS / "quickstart.yaml").read_text(encoding="utf-8").replace("data/agarose_synthetic.csv", "b.csv")
     )
-    assert data.read_bytes() == held
+    for words in (("init", "--data", data), ("init", "--data", "."), ("init", "--data", "*.csv"), ("simulate", config)):
+        done = call(*words, "--out", "b.csv", "--force")
+        assert done.stderr == "b.csv: is what the command reads, and is not replaced; give another name\n"
+        assert (done.exit_code, data.read_bytes()) == (2, held)
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_a_fault_in_the_value_of_an_option_is_told_of_the_option() -> None:
+    told = call("run", CONFIGS / "quickstart.yaml", "--scheduler", "foo").stderr
+    assert told == "--scheduler: expected an address such as tcp://10.0.0.1:8786, not 'foo'\n"
+    told = call("run", CONFIGS / "quickstart.yaml", "--set", "name=-x").stderr
+    assert told == "--set name: expected letters, digits, blanks and . + - _, a letter or digit first, not '-x'\n"

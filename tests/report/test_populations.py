@@ -176,6 +176,10 @@ def test_runs_of_two_gels_are_compared_by_their_populations_and_by_nothing_else(
         (["--against", "5;6"], "no list of numbers"),
         (["--apart", "rho"], "rho: not common to the data sets of any population"),
         (["--known", "stiff_only:k"], "is no median such as"),
+        (
+            ["--known", "stiff_only:k=3 ± 1 N/m", "--known", "stiff_only:k=4 ± 1 N/m"],
+            "stiff_only:k is given two values",
+        ),
         (["--known", "stif_only:k=3 ± 0.1"], "stif_only, of which something is known: no such run"),
         (["--known", "stiff_only:G=3 ± 0.1"], "G: not a parameter of the population of stiff_only"),
         (["--known", "stiff_only:k=3 N/m"], "say how well it is known"),
