@@ -11,7 +11,7 @@ from toys import Vectorised, make_problem, with_discrepancy
 
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import _empirical, population_of
+from en4dvar.estimation.population.campaign import _empirical, population_of, sampled_sets
 from en4dvar.estimation.population.following import Following
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.own import (
@@ -303,6 +303,16 @@ def test_data_sets_that_cannot_be_sampled_are_named():
     assert list(found.left_out) == ["set2"]
     assert len(found.problems) == SETS - 1
     assert any("set2 is left out" in c.words for c in _cautions(found))
+
+
+def test_a_data_set_whose_draws_coincide_is_told_in_words():
+    """Readings with errors of a millionth, which one draw alone fits."""
+    problems = campaign(truths(0.2))[:3]
+    kept, observations = known(problems, 2), problems[2].observations
+    noise = noise_of(1e-6 * observations.std, 0 * observations.std)
+    problems[2] = replace(problems[2], observations=replace(observations, noise=noise))
+    with pytest.raises(ValueError, match="only 2 of 3 data sets can be sampled; set2: its draws coincide"):
+        sampled_sets(problems, members(problems), 2, None, list, [*kept[:2], None])
 
 
 def test_one_draw_that_has_all_the_weight_is_told_as_too_few(monkeypatch):

@@ -40,6 +40,10 @@ from en4dvar.problem import AT_ONCE, InverseProblem, common_to
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
 IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
 HALF_NORMAL_VARIANCE = 1 - 2 / np.pi
+COINCIDE = (
+    "its draws coincide, so that nothing tells how far its parameters may be off; the errors stated of its readings "
+    "may be far too small, or these readings wrong"
+)
 FEWEST_SETS = 3  # with fewer nothing is known of a spread
 FEWEST = 100.0  # effective draws of a result that can be trusted
 REACH = 1.5  # prior standard deviations: a hyperprior of mean and spread that reaches further needs draws that do
@@ -316,13 +320,14 @@ def sampled_sets(
         name = problem.observations.name
         try:
             drawn[s] = own or own_draws(problem, members, seed, executor)
-        except ValueError as error:
-            left_out[name] = str(error)
-            tell(f"{name}: left out, {error}")
+        except ValueError as error:  # a kind of which is LinAlgError, of a matrix nobody else knows
+            left_out[name] = COINCIDE if isinstance(error, np.linalg.LinAlgError) else str(error)
+            tell(f"{name}: left out, {left_out[name]}")
         else:
             tell(f"{name}: {drawn[s].forward_runs} forward runs, {drawn[s].effective:.0f} effective draws")
     if len(drawn) < FEWEST_SETS:
-        raise ValueError(f"only {len(drawn)} of {len(problems)} data sets can be sampled; the first is {left_out}")
+        told = "; ".join(f"{name}: {reason}" for name, reason in [*left_out.items()][:1])
+        raise ValueError(f"only {len(drawn)} of {len(problems)} data sets can be sampled; {told}")
     return drawn, left_out
 
 
