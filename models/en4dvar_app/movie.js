@@ -7,7 +7,7 @@ const LINE = /^\s*(\d+)\s+(\S.*)$/;
 // Until the next movie is there none is shown, and no frame of the last one comes any more.
 function noMovie() { movie = null; $("inspector").hidden = true; latest("frame", Promise.resolve()); }
 
-async function readMovie(afresh = true) {
+async function readMovie(afresh = true, chosen = true) {
   const name = $("movie").value;
   if (!name) return;
   if (afresh) { noMovie(); $("length").value = ""; recall("track"); }
@@ -16,7 +16,7 @@ async function readMovie(afresh = true) {
     const [seen, { text }] = await latest("movie", Promise.all([fetched("movie", { movie: name, raw }), fetched("text", { movie: name })]));
     movie = Object.assign(movie || { name, raw, picture: null }, seen);
     if (afresh) $("corrections").value = kept = text;
-  } catch (error) { noMovie(); return say(error.message); }
+  } catch (error) { noMovie(); return chosen && say(error.message); }
   if (afresh) {
     bitmaps.clear(); at = 0; bar = null;
     if (movie.pixel) $("pixel").value ||= `${+(movie.pixel * 1e6).toPrecision(9)} um`;
@@ -206,7 +206,7 @@ $("corrections").addEventListener("change", () => keepCorrections());
 $("length").addEventListener("change", scaled);
 $("mask").addEventListener("change", showMask);
 for (const id of ["region", "bubble"]) $(id).addEventListener("change", () => draw());
-for (const id of ["movie", "raw"]) $(id).addEventListener("change", () => readMovie());
+for (const id of ["movie", "raw"]) $(id).addEventListener("change", (event) => readMovie(true, event.bubbles)); // a hand's event bubbles
 $("inspector").addEventListener("keydown", (event) => {
   if (!movie || event.ctrlKey || event.altKey || event.metaKey || ["TEXTAREA", "SELECT"].includes(event.target.tagName)) return;
   if (event.target.tagName === "INPUT" && event.target.type !== "range") return;

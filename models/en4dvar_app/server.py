@@ -81,7 +81,7 @@ class Guarded(tornado.web.RequestHandler):
         except (En4dvarError, OSError, UnicodeError) as error:
             self.set_status(400)
             self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(str(error))
+            self.finish(str(error).replace("(data.sheet)", "in the field Sheet"))
             return None
 
 

@@ -104,9 +104,16 @@ def workbook(tmp_path):
 
 
 def test_two_bubbles_of_a_workbook_are_two_intervals(visit, serve, workbook, tmp_path):
+    (workbook / "plots").mkdir()
+    for n in (1, 2):  # pictures that are no movie, which nobody chooses
+        Image.new("L", (10, 10 * n)).save(workbook / "plots" / f"{n}.png")
     page = visit(serve(workbook))
+    page.wait_for_load_state("networkidle")
+    assert (page.input_value("#movie"), page.inner_text("#message")) == ("plots", "")
+    page.select_option("#movie", "plots")
+    until(page, "message.innerText.includes('plots')")
     page.select_option("#table", "messung.xlsx")
-    until(page, "message.innerText.includes('2 sheets hold something')")
+    until(page, "message.innerText.includes('2 sheets hold something; say which in the field Sheet')")
     page.fill("#sheet", "Film 3")
     page.press("#sheet", "Tab")
     until(page, "[...by.options].some((o) => o.value === 'gel')")
