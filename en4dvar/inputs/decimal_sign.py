@@ -28,7 +28,8 @@ SEVERAL = 2  # other numbers that are needed: a single one, again and again, may
 
 
 def closed_up(cell: str) -> str:
-    """A number without the blanks or apostrophes between its thousands."""
+    """A number without the blanks or apostrophes between its thousands, its minus as Python writes it."""
+    cell = cell.replace("\u2212", "-")
     match = _SET_APART.fullmatch(cell)
     return cell.replace(match[1], "") if match else cell
 

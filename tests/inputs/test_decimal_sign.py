@@ -48,7 +48,7 @@ def test_the_column_tells_or_else_the_table(tmp_path, R, numbers, german):
 @pytest.mark.parametrize("sign", ["'", "’", " ", "\u00a0", "\u2009", "\u202f"])
 def test_apostrophes_and_blanks_separate_thousands_only(tmp_path, sign):
     text = f"t;R\n0;126{sign}000.5\n2{sign}000;1{sign}162{sign}000\n4{sign}000;-1{sign}500.125\n"
-    for written, decimal in ((text, "."), (text.replace(".", ","), ",")):
+    for written, decimal in ((text, "."), (text.replace(".", ","), ","), (text.replace("-", "\u2212"), ".")):
         columns = contents(tmp_path, written, decimal).columns
         assert columns["t"].tolist() == [0, 2000, 4000]
         assert columns["R"].tolist() == [126000.5, 1162000, -1500.125]
