@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
-from en4dvar.plumbing.files import open_plain
+from en4dvar.plumbing.files import open_plain, replace_file, temporary_folder
 from en4dvar.plumbing.hints import beside
 from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_about, video_frames
 from en4dvar_movie.numbering import in_order
@@ -266,13 +266,16 @@ def write_movie(path: Path, frames: Iterable[Frame], count: int, pixel: float, r
     require_suffix(path)
     stream = iter(frames)
     first = next(stream)
-    with retold((OSError, ValueError), DataError, f"{path}: cannot be written: "):
+    told = retold((OSError, ValueError), DataError, f"{path}: cannot be written: ")
+    with told, temporary_folder(path.absolute().parent) as folder:  # suffix and whole file in the end
+        partial = folder / path.name
         if path.suffix.lower() in TIFF:
-            _write_tiff(path, first, stream, count, pixel, rate)
+            _write_tiff(partial, first, stream, count, pixel, rate)
         elif first.dtype.itemsize > 1:
             raise DataError(f"{path}: a video holds 8 bits; write more as .tif")
         else:
-            _write_video(path, first, stream)
+            _write_video(partial, first, stream)
+        replace_file(partial, path)
 
 
 def _write_tiff(path: Path, first: Frame, others: Iterator[Frame], count: int, pixel: float, rate: float) -> None:

@@ -167,6 +167,19 @@ def test_a_grey_video_is_written_without_loss(tmp_path, suffix):
     assert np.array_equal(read(tmp_path / f"m{suffix}"), FRAMES)
 
 
+@pytest.mark.parametrize("suffix", [".tif", ".avi"])
+def test_a_movie_that_ends_in_an_error_leaves_the_earlier_one(tmp_path, suffix):
+    def frames():
+        yield from FRAMES[:2]
+        raise OSError("the disk is full")
+
+    path = tmp_path / f"m{suffix}"
+    path.write_bytes(b"earlier")
+    with pytest.raises(DataError, match="cannot be written: the disk is full"):
+        write_movie(path, frames(), 4, 1e-6, 1e5)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {path.name: b"earlier"}
+
+
 def test_a_video_that_is_cut_off_says_what_is_missing_and_which_frame_is_damaged(tmp_path):
     write_movie(tmp_path / "m.avi", iter(np.tile(FRAMES, (5, 1, 1))), 20, 1e-6, 1e5)
     whole = (tmp_path / "m.avi").read_bytes()
