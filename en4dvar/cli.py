@@ -83,6 +83,8 @@ class Commands(click.Group):
         except (OSError, ValueError) as error:
             if _output() != output:
                 raise _closed_output() from error
+            if isinstance(error, PermissionError) and error.filename:  # as of a folder that others may not look into
+                raise Failed(f"{error.filename}: {error.strerror}", 2) from error
             if isinstance(error, OSError) and error.errno in OF_THE_DEVICE:
                 if error.filename is None:  # or what is left of it is tried again, and told, when the interpreter ends
                     give_up_output()

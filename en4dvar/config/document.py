@@ -30,6 +30,7 @@ Source = str | Path | Mapping[str, Any]  # of a configuration
 LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
 
 OPTIONS = {"data.path": "--data", "execution.address": "--scheduler"}  # keys that a command has an option for
+NOT_UTF8 = "a byte that is not UTF-8, in the name of a file or folder perhaps, which then needs another one"
 NULL = "a null byte, which no name, word or number holds"
 _INT = re.compile(r"[-+]?\d{1,40}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
@@ -136,7 +137,8 @@ def document_of(content: Mapping[Any, Any]) -> Document:
 def yaml_text(data: Any) -> str:
     """Plain data as YAML, in its own order; by the compiled library where PyYAML has it."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=120))
+    with retold(UnicodeEncodeError, ConfigError, f"{NOT_UTF8}: "):
+        return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=120))
 
 
 def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> Any:
@@ -257,7 +259,8 @@ def _read(document: Document, faults: list[Fault]) -> Any:
             words += "; in double quotes a backslash stands for another sign: use single quotes, or / in paths"
         refuse(words, *where)
     except yaml.YAMLError as error:
-        refuse(f"not valid YAML: {str(error).splitlines()[0]}")
+        words = str(error).splitlines()[0]
+        refuse(f"{NOT_UTF8 if '#xdc' in words else 'not valid YAML'}: {words}")
     except RecursionError:
         refuse("not valid YAML: nested too deeply")
     return None

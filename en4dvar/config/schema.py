@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, create_model, model_validator
 from pydantic.fields import FieldInfo
 from pydantic.functional_validators import ModelWrapValidatorHandler
-from pydantic_core import from_json, to_json
+from pydantic_core import to_jsonable_python
 
 from en4dvar.config.context import Context, Faults, Made, Unknown
 from en4dvar.config.quantities import quantity
@@ -92,7 +92,7 @@ def _as_a_file_says(field: FieldInfo) -> Any:
 
 def _plain(value: Any) -> Any:
     """As YAML and JSON have it: no tuples, paths or numbers of other kinds."""
-    return from_json(to_json(value))
+    return to_jsonable_python(value)
 
 
 def section_of(*kinds: Any, base: type[Section] = Section) -> Any:

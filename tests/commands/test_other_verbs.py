@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -76,6 +78,16 @@ def test_readings_are_not_replaced_by_what_is_proposed_for_them(tmp_path: Path) 
         done = call(*words, "--out", "b.csv", "--force")
         assert done.stderr == "b.csv: is what the command reads, and is not replaced; give another name\n"
         assert (done.exit_code, data.read_bytes()) == (2, held)
+
+
+def test_a_folder_that_others_may_not_look_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    def looked(self: Path, **how: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "is_dir", looked)
+    done = call("init", "--data", "private/b.csv")
+    assert done.exit_code == 2
+    assert done.stderr.endswith("private/b.csv: Permission denied\n")
 
 
 @pytest.mark.usefixtures("own_folder")

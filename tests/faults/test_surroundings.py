@@ -21,8 +21,11 @@ from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 from toy_config import csv_text, write_toy
 
+from en4dvar.config import load_config
 from en4dvar.plumbing import files
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.runner import run_campaign
+from en4dvar_bubble.starter.config import propose_config
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -136,6 +139,16 @@ def test_names_that_are_not_text(tmp_path):
     (failed,) = campaign.failures
     assert "\\udcff.csv: " in failed.failure
     assert (tmp_path / "run" / "summary.csv").read_text(encoding="utf-8").count("\\udcff") == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
+def test_names_that_are_not_text_cannot_be_said_in_a_configuration(tmp_path):
+    path = os.fsdecode(os.fsencode(tmp_path) + b"/g\xfcl.csv")
+    with pytest.raises(ConfigError, match=r"^a byte that is not UTF-8, in the name of a file or folder perhaps"):
+        load_config(write_toy(tmp_path), {"data.path": [path]})
+    Path(path).write_text("t_us,R_um\n" + "".join(f"{t},{100 - t * t}\n" for t in range(9)))
+    with pytest.raises(ConfigError, match=r"^a byte that is not UTF-8, in the name of a file or folder perhaps"):
+        propose_config(path, time=("t_us", "us"), radius=("R_um", "um"))
 
 
 @pytest.mark.parametrize(("name", "value"), [("NUMBA_DISABLE_JIT", "1"), ("SOURCE_DATE_EPOCH", "junk")])
