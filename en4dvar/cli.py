@@ -21,7 +21,7 @@ from en4dvar.commands.run import run, validate
 from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed
-from en4dvar.runs.interrupt import heeded
+from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
 
 # Told by what writes; here is what is left
 OF_THE_DEVICE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
@@ -64,7 +64,7 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         output = _output()
         try:
-            with heeded(_end):
+            with heeded(_end), terminate_as_interrupt():
                 value = super().invoke(ctx)
             sys.stdout.flush()
             if _output() != output:  # what was printed is nowhere, or in a file that has its number now

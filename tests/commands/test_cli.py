@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -371,3 +372,17 @@ def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:
     assert f"--force replaces it, --out {tmp_path / 'out_2'} keeps both" in again.stderr
     (tmp_path / "out" / "posterior.nc").unlink()
     assert "a run; --resume continues it if it has not ended" in call(*arguments).stderr
+
+
+def test_a_stop_by_the_system_is_heeded_by_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that is no run ended where it stood, and its temporary folders stayed."""
+
+    def stopped() -> str:
+        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+        signal.raise_signal(signal.SIGTERM)
+        return "models"
+
+    monkeypatch.setattr("en4dvar.config.models.model_listing", stopped)
+    outcome = call("models")
+    assert (outcome.exit_code, outcome.output) == (130, "terminated\n")
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
