@@ -29,13 +29,15 @@ class QuantileMap(NamedTuple):
     """A distribution of the share u = (θ − a)/scale, whose scale is b − a, or the std s where there is no b.
 
     ``below`` gives u from x < 0, ``above`` from x ≥ 0 what is left to the upper bound, 1 − u, or u itself where
-    there is none; ``score`` x from u and 1 − u; ``log_density`` ln of the density of u, from the same two.
+    there is none, which ``upper`` says; ``score`` x from u and 1 − u; ``log_density`` ln of the density of u, from the
+    same two.
     """
 
     below: Callable[[Array, Numbers], Array]
     above: Callable[[Array, Numbers], Array]
     score: Callable[[Array, Array, Numbers], Array]
     log_density: Callable[[float, float, Numbers], float]
+    upper: bool = True
 
 
 def _half_normal_score(u: Array, _: Array, shape: Numbers) -> Array:
@@ -102,6 +104,7 @@ QUANTILE_MAPS: Mapping[str, QuantileMap] = {
         above=lambda x, shape: -ndtri_exp(log_ndtr(-x) - math.log(2)),
         score=_half_normal_score,
         log_density=lambda u, rest, shape: math.log(2) - LOG_ROOT_2PI - 0.5 * u * u,
+        upper=False,
     ),
     "beta": QuantileMap(
         below=lambda x, shape: betaincinv(*shape, ndtr(x)),

@@ -159,7 +159,7 @@ class PriorTerm:
     @classmethod
     def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> Self:
         (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
-        finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
+        finite = math.isfinite(low) and (math.isfinite(high) or not QUANTILE_MAPS[kind].upper)
         term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")
         return term
 

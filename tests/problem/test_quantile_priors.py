@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.integrate import quad
-from scipy.special import ndtr, ndtri
+from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 from toy_config import write_toy
 from toys import OBSERVABLE, Vectorised, make_observations
 
@@ -83,7 +83,7 @@ def test_moments_by_quadrature_and_of_draws(name):
 
 
 def test_a_kind_of_ones_own_needs_its_map_alone(monkeypatch):
-    """As CONTRIBUTING says, here log-uniform between a and b; its one number is ln b/a."""
+    """As CONTRIBUTING says, here log-uniform between a and b, whose one number is ln b/a, and exponential."""
     own = parameter_map.QuantileMap(
         below=lambda x, shape: np.expm1(shape[0] * ndtr(x)) / math.expm1(shape[0]),
         above=lambda x, shape: np.expm1(-shape[0] * ndtr(-x)) / math.expm1(-shape[0]),
@@ -94,12 +94,22 @@ def test_a_kind_of_ones_own_needs_its_map_alone(monkeypatch):
         ),
         log_density=lambda u, rest, shape: -math.log(shape[0] * (u + 1 / math.expm1(shape[0]))),
     )
-    monkeypatch.setitem(parameter_map.QUANTILE_MAPS, "log-uniform", own)
-    term = PriorTerm._by_quantiles(A, "log-uniform", (0.1, 10.0), (math.log(100),))
-    monkeypatch.setitem(NAMED, "log-uniform", (term, stats.loguniform(0.1, 10.0)))
-    test_the_score_is_that_of_the_distribution("log-uniform")
-    test_the_density_in_the_displayed_quantity("log-uniform")
-    test_moments_by_quadrature_and_of_draws("log-uniform")
+    without_end = parameter_map.QuantileMap(
+        below=lambda x, shape: -log_ndtr(-x),
+        above=lambda x, shape: -log_ndtr(-x),
+        score=lambda u, rest, shape: np.where(u < 0.5, ndtri(-np.expm1(-u)), -ndtri_exp(-u)),
+        log_density=lambda u, rest, shape: -u,
+        upper=False,
+    )
+    for name, kind, bounds, shape, named in (
+        ("log-uniform", own, (0.1, 10.0), (math.log(100),), stats.loguniform(0.1, 10.0)),
+        ("exponential", without_end, (0.5, math.inf), (2.0,), stats.expon(0.5, 2.0)),
+    ):
+        monkeypatch.setitem(parameter_map.QUANTILE_MAPS, name, kind)
+        monkeypatch.setitem(NAMED, name, (PriorTerm._by_quantiles(A, name, bounds, shape), named))
+        test_the_score_is_that_of_the_distribution(name)
+        test_the_density_in_the_displayed_quantity(name)
+        test_moments_by_quadrature_and_of_draws(name)
 
 
 def test_tails_keep_their_distance_to_the_bound():
