@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import lognorm, norm, uniform
+from scipy.stats import beta, lognorm, norm, uniform
 
 from en4dvar import estimate
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
@@ -52,6 +52,14 @@ def test_the_prior_is_drawn_as_its_density_and_not_from_draws(analysis):
         np.testing.assert_allclose(density[inner], exact.pdf(x[inner]) / exact.pdf(peak), atol=0.006)
         assert x[0] == pytest.approx(exact.ppf(norm.cdf(-4)))
         assert x[-1] == pytest.approx(exact.ppf(norm.cdf(4)))
+
+
+def test_a_prior_with_values_that_are_a_bound_to_rounding_is_drawn(analysis):
+    x, density = densities(with_terms(analysis, PriorTerm.beta(Parameter("G", "Pa"), (0.0, 1.0), 1.0, 0.1)))[0]
+    assert np.all(np.isfinite(density))
+    inner = (x > 0.1) & (x < 0.99)
+    shape = beta(1.0, 0.1).pdf(x[inner])
+    np.testing.assert_allclose(density[inner] / density[inner][0], shape / shape[0], rtol=0.1)
 
 
 def test_a_result_of_before_shows_the_draws_that_it_holds(analysis):
