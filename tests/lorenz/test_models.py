@@ -57,6 +57,16 @@ def test_a_state_of_other_numbers_is_integrated_in_double_precision(name, kind):
     np.testing.assert_allclose(model.step(other, 0.0, 0.1), expected[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_a_clock_that_begins_before_the_model_moves_nothing_later(name):
+    """As a negative t_s makes it: paths began at their first instant, however early, instead of time zero."""
+    model, times = MODELS[name], np.array([-0.1, 0.1, 0.3])
+    start = state(model, np.arange(1.0, 4.0))
+    before, *later = model.trajectories(start[None], times)[0].states
+    np.testing.assert_allclose(later, model.trajectories(start[None], times[1:])[0].states, rtol=1e-4)
+    np.testing.assert_allclose(model.step(before, -0.1, 0.0), start, rtol=1e-3, atol=1e-3)
+
+
 def lorenz63_by_hand(t, v):
     x, y, z = v
     return [10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z]
