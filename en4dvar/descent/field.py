@@ -112,16 +112,15 @@ class DualSystem:
         return np.asarray(np.linalg.solve(system, self.innovation + a * self.moved), dtype=np.float64)
 
     @property
-    def dfs(self) -> float:
-        """The trace of H B Hᵀ (H B Hᵀ + R)⁻¹."""
-        return float(np.trace(np.linalg.solve(self.covariance + np.diag(self.variance), self.covariance)))
+    def leverages(self) -> Array:
+        """(K,) of the readings, the diagonal of H B Hᵀ (H B Hᵀ + R)⁻¹; their sum are the degrees of freedom."""
+        return np.diag(np.linalg.solve(self.covariance + np.diag(self.variance), self.covariance))
 
     @property
     def length(self) -> float:
         """Of the full step: the largest change of a prediction, in its posterior standard deviations."""
-        C = self.covariance
-        variance = np.diag(C) - np.sum(C * np.linalg.solve(C + np.diag(self.variance), C), axis=0)
-        return float(np.max(np.abs(C @ self.dual() - self.moved) / np.sqrt(np.maximum(variance, 1e-300))))
+        std = np.sqrt(np.maximum(self.leverages * self.variance, 1e-300))
+        return float(np.max(np.abs(self.covariance @ self.dual() - self.moved) / std))
 
 
 @dataclass
@@ -292,7 +291,7 @@ class FieldObjective(Objective[FieldDescent]):
             return np.asarray(centre[part] + anomalies + update(part, anomalies))
 
         background = self.background(at.tangents, at.duals)
-        return Pass(centre, at.prediction, members, background, at.step.length, dfs=at.step.dfs)
+        return Pass(centre, at.prediction, members, background, at.step.length, dfs=float(at.step.leverages.sum()))
 
     def update(self, tangent: Tangent) -> Update:
         """What turns prior anomalies into posterior ones."""

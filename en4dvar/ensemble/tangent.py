@@ -19,7 +19,7 @@ from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
 
 CLOSE = 1e-3  # of the members' distance from the centre, where all but F is differenced
-STEPS = (1e-3, 1e-5, 3e-2)  # prior standard deviations between runs that derivatives are compared with
+STEPS = (1e-3, 1e-5, 1e-7, 3e-2)  # prior standard deviations between runs that derivatives are compared with
 APART = 0.02  # of a derivative, by which it may differ from that of runs; NOTHING of the largest one
 NOTHING = 1e-6
 KEY = "assimilation.linearisation"

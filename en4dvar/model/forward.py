@@ -345,7 +345,8 @@ class ForwardModel(ABC):
         return np.stack([floats(self.initial_state(own), "initial_state") for own in each])
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
-        """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
+        """F_{t1←t0}: advance one state (n_state,); back from time zero where a time shift puts a reading before it. May
+        raise; the caller turns it into a :class:`Failure`.
 
         A model that overrides :meth:`trajectories` needs no step, but what resumes a state at any instant does: schemes
         of a series and parameters that vary in time.
@@ -358,7 +359,8 @@ class ForwardModel(ABC):
         Parameters
         ----------
         x: initial states (N, n_state).
-        times: increasing observation times (K,), or (N, K) where each member has its own.
+        times: increasing observation times (K,), or (N, K) where each member has its own; with a time shift the first
+            may lie before time zero.
 
         Returns
         -------

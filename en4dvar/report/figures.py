@@ -63,7 +63,8 @@ def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array
 
     place = stats["parameter"].values.tolist().index(name)
     values = shown(result.parameters[name], stats["prior_value"].values[place])
-    density = np.diff(ndtr(stats["prior_score"].values)) / np.diff(values)
+    values, own = np.unique(values, return_index=True)  # beside a bound some are equal to rounding
+    density = np.diff(ndtr(stats["prior_score"].values[own])) / np.diff(values)
     x = np.concatenate([values[:1], values[:-1] + np.diff(values) / 2, values[-1:]])
     density = np.concatenate([density[:1], density, density[-1:]]) / density.max()
     return x, np.zeros_like(x), density

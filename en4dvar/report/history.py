@@ -76,8 +76,9 @@ def _quantity(observed: Variable) -> str:
 
 
 def _predictions(panel: Panel, result: StoredResult, name: str, x: Array, centre: Array) -> None:
-    """Along the path, or at each reading of a field."""
-    curve = f"{name}_path" in result.group("prior_predictive")
+    """Along the path, or at each reading of a field, and at a single instant."""
+    prior = result.group("prior_predictive")
+    curve = f"{name}_path" in prior and np.ptp(prior["path_time"].values) > 0
     for group, levels, colour, alpha, label in BANDS:
         held = result.group(group)
         values = shown(held[f"{name}_path" if curve else name])[0]
@@ -141,7 +142,7 @@ def prior_predictive(previews: Sequence[Preview]) -> Chart:
             at += width * part.has_path
     del drawn[PANELS:]
     for preview, part, path in drawn:
-        panel = _prior(preview, part, path)
+        panel = _prior(preview, part, path if np.ptp(preview.grid) > 0 else None)
         if len(drawn) > 1:
             name = preview.problem.observations.name
             panel.title = figure_text(f"{name}: {part.name}" if len(preview.problem.parts) > 1 else name)

@@ -308,7 +308,7 @@ class Dynamics:
         R = values.get(R_START.name, rest) if self.start == "acoustic" else values["R_max"]
         if np.any(rest <= 0) or np.any(R <= 0):
             raise ValueError("radii must be positive")
-        if self.wall is not None and np.all(self.wall.away(values) <= R):
+        if self.wall is not None and np.any(self.wall.away(values) <= R):
             raise ValueError("the bubble reaches the wall: R at time zero must be less than the distance of the wall")
         medium, layout, system = self.medium_of(values), self.layout, self.system
         p_v = medium.p_v if self.vapour == "none" else saturated_vapour_pressure(medium.T_inf)

@@ -3,10 +3,11 @@ r"""Observables that need no camera: the turning points of a bubble, and the pre
 Largest radius, collapses, rebounds. An event is where the wall stands still, Ṙ = 0: functionals of the path, the same
 whatever instant they are read at. The largest maximum comes first (a released bubble starts there), then collapses and
 rebounds in turn. The time of an event is counted from the start of the model, which a released bubble's R_max is; the
-time between two does not depend on it. Paths are followed to :data:`HORIZON` times the last reading, on a grid; each
-bracket of Ṙ = 0 is then divided twice by running the members again at instants of their own, and Ṙ is taken for linear
-in the last. A bubble of 300 µs has its collapse to better than 0.1 ns (tests/bubble/test_events.py). A member that has
-no such event (NaN) is excluded by the reading of it; one whose run fails (infinity) is lost.
+time between two does not depend on it. Paths are followed to :data:`HORIZON` times the last reading, on a grid; where
+the events end long before, again on a grid that ends with them. Each bracket of Ṙ = 0 is then divided twice by running
+the members again at instants of their own, and Ṙ is taken for linear in the last. A bubble of 300 µs has its collapse
+to better than 0.1 ns (tests/bubble/test_events.py). A member that has no such event (NaN) is excluded by the reading of
+it; one whose run fails (infinity) is lost.
 
 A hydrophone far away. Near the bubble the liquid is incompressible, far from it the wave is φ = −F(t − r/c)/r (Keller &
 Miksis 1980, J. Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
@@ -30,6 +31,7 @@ from en4dvar_bubble.paths import OF_WHOLE, OfPath, Paths
 
 HORIZON = 2.0  # of the last reading
 GRID, PARTS = 240, 24  # instants of the first run, and of each bracket in a later one
+SHORTER, ROUNDS = 0.8, 6  # part of a grid that the events must reach to, else another one ends there; grids at most
 COLLAPSES = 3
 
 
@@ -43,8 +45,14 @@ def events(paths: Paths) -> Mapping[str, Array]:
         raise ValueError("collapses and rebounds are read from whole paths, which a resumed one is not")
     model: Any = paths.model
     until = HORIZON * np.max(paths.times, axis=1, keepdims=True)
-    times = until * np.linspace(0, 1, GRID)
-    low, high = _brackets(model.integrate(paths.initial, times), times)
+    for _ in range(ROUNDS):
+        times = until * np.linspace(0, 1, GRID)
+        low, high = _brackets(model.integrate(paths.initial, times), times)
+        end = np.nan_to_num(high).max(axis=1, keepdims=True)
+        ends = (end > 0) & (end < SHORTER * until)
+        if not ends.any():
+            break
+        until = np.where(ends, end, until)
     for _ in range(2):
         times = low[..., None] + (high - low)[..., None] * np.linspace(0, 1, PARTS)
         flat = np.where(np.isfinite(times), times, until[..., None]).reshape(len(times), -1)
@@ -79,7 +87,10 @@ def _brackets(run: Paths, times: Array) -> tuple[Array, Array]:
             low[i, 0], high[i, 0], first = times[i, 0], times[i, 0], turns[turns > 0]
         else:
             after = turns[turns >= top - 1]
-            if not len(after) or run["Rdot"][i, after[0]] < 0:
+            if not len(after):
+                continue
+            if run["Rdot"][i, after[0]] < 0:  # more than one turn between two instants: a finer grid tells
+                high[i, 0] = times[i, after[:count][-1] + 1]
                 continue
             low[i, 0], high[i, 0], first = times[i, after[0]], times[i, after[0] + 1], after[1:]
         kept = first[: count - 1]

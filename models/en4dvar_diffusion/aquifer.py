@@ -76,7 +76,7 @@ class Aquifer(ForwardModel):
 
     def _path(self, state: Array, times: Array) -> Trajectory:
         states = np.tile(np.asarray(state, dtype=float), (len(times), 1))
-        for row, head in zip(states, self._heads(state, np.diff(times, prepend=0.0)), strict=True):
+        for row, head in zip(states, self._heads(state, np.diff(np.maximum(times, 0.0), prepend=0.0)), strict=True):
             row[: self.size] = head
         return Trajectory(np.asarray(times, dtype=float), states, self.layout)
 

@@ -42,6 +42,7 @@ def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarra
 class Lorenz63(Analytic):
     """Three variables, chaotic at the default parameters."""
 
+    dense = False  # other instants are other steps, of which chaos makes another path
     Settings = Lorenz63Settings
     parameters = (
         dimensionless("sigma", "Prandtl number", r"$\sigma$", SOURCE),

@@ -43,6 +43,7 @@ def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarra
 class Lorenz96(Analytic):
     """A field on a circle of latitude, chaotic at the default forcing."""
 
+    dense = False  # as of Lorenz-63
     Settings = Lorenz96Settings
     parameters = (dimensionless("F", "forcing", "$F$", "Lorenz (1996)"),)
     defaults: Mapping[str, float] = {"F": 8.0}

@@ -20,7 +20,7 @@ def kept(function: F) -> F:
 def rk4(
     tendency: Callable[[np.ndarray, np.ndarray], None], start: np.ndarray, times: np.ndarray, longest: float
 ) -> np.ndarray:
-    """Paths (N, K, n) of states (N, n) at increasing times (N, K) from zero.
+    """Paths (N, K, n) of states (N, n) at increasing times (N, K), from time zero to either side.
 
     ``tendency(x, dx)``, an njit function, writes dx/dt of one state into ``dx``. Every interval is cut into equal steps
     no longer than ``longest``.
@@ -33,7 +33,7 @@ def rk4(
             x[j] = start[i, j]
         t = 0.0
         for k in range(times.shape[1]):
-            steps = int(np.ceil((times[i, k] - t) / longest - 1e-9))
+            steps = int(np.ceil(abs(times[i, k] - t) / longest - 1e-9))
             h = (times[i, k] - t) / max(steps, 1)
             for _ in range(steps):
                 tendency(x, slope)

@@ -19,7 +19,8 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
-from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
+from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt, get_law
+from en4dvar_bubble.driving import gaussian
 from en4dvar_bubble.events import events
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -60,6 +61,26 @@ def test_what_is_read_does_not_depend_on_when(paths):
         assert read == pytest.approx(np.tile(OBSERVED[name].operator(paths), (1, 5)), rel=1e-6)
         assert OBSERVED[name].operator(whole[1]) == pytest.approx(read[1], rel=1e-12)
     assert np.isnan(OBSERVED["collapse_time_3"].operator(MODEL.integrate(paths.initial, np.full((2, 1), 1e-5)))).all()
+
+
+def test_events_stay_where_they_are_in_a_record_that_is_long_beside_them(paths):
+    """A collapse and a rebound between two instants of a grid were none, and the second collapse the fourth."""
+    found, long = events(paths), events(MODEL.integrate(paths.initial, np.tile([4e-3], (2, 1))))
+    assert long["time"][:, :4] == pytest.approx(found["time"][:, :4], rel=1e-5)
+    assert long["radius"][:, :4:2] == pytest.approx(found["radius"][:, :4:2], rel=1e-5)
+
+
+def test_the_largest_radius_of_a_fast_bubble_is_found():
+    """One that is pressed together rings eighty times in the record."""
+    model = BubbleModel(law=get_law("newtonian"), gas="polytropic", driving=gaussian(3e5, 4e-6, 0.5e-6))
+    paths = model.integrate(
+        model.initial_states({"mu": np.full(1, 2e-3), "R0": np.full(1, 1.22e-6)}), np.array([25e-6])
+    )
+    times = np.linspace(0, 25e-6, 20001)
+    dense = model.integrate(paths.initial, times)["R"][0]
+    found = events(paths)
+    assert found["radius"][0, 0] == pytest.approx(dense.max(), rel=1e-6)
+    assert found["time"][0, 0] == pytest.approx(times[np.argmax(dense)], abs=2e-9)
 
 
 def test_a_resumed_path_has_no_events(paths):

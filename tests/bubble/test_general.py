@@ -52,6 +52,23 @@ class TestAgreementWithThePaperEquations:
         conducting = laser(medium_heat="conducting", medium=replace(WATER_25C, K_m=1e6, c_m=1e9))
         assert float(np.abs(conducting.R - laser().R).max()) < 1e-4 * 230e-6
 
+    @pytest.mark.parametrize(
+        ("law", "viscous"),
+        [
+            ("carreau", {"mu_0": 0.2, "mu_inf": 0.2, "shear_time": 1e-7, "n": 1.0}),
+            ("church-shell", {"mu": 0.2, "mu_s": 0.2, "G_s": 0.0, "thickness": 1e-7}),
+        ],
+    )
+    def test_viscosity_that_depends_on_nothing_heats_like_a_dashpot(self, law, viscous):
+        """The path differs by 4e-3 of R_max without the heat."""
+        radii = {"R_max": 300e-6, "R_eq": 40e-6}
+        options = {"start": "laser", "medium_heat": "conducting", "vapour": "transport"}
+        R, dashpot = (
+            simulate(name, {**radii, **own}, TIMES[:600], **options).R
+            for name, own in ((law, viscous), ("newtonian", {"mu": 0.2}))
+        )
+        assert float(np.abs(R - dashpot).max()) < 1e-6 * 300e-6
+
     def test_vapour_of_vanishing_pressure_is_none(self, monkeypatch):
         monkeypatch.setattr("en4dvar_bubble.paths.SATURATION", 1.0)
         monkeypatch.setattr("en4dvar_bubble.dynamics.saturated_vapour_pressure", lambda T: 1e-6)

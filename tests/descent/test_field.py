@@ -72,6 +72,17 @@ def test_en4dvar_of_a_linear_field_is_that_of_the_schur_product():
     assert np.max(np.abs(found - expected)) < 1e-10
 
 
+def test_a_step_that_is_over_is_short_whatever_the_readings_errors():
+    """In posterior standard deviations of predictions, which were lost to rounding: the next step had 1e134 of them."""
+    ensemble, data, read = small()
+    exact, told = FieldData(data.values, np.full(5, 1e-9), data.forward), []
+    end = field_en4dvar(ensemble, exact, line(30, read, 4.0), tell=told.append)
+    assert len(told) == 2
+    assert told[1].step < 1e-3
+    assert told[1].dfs == pytest.approx(5)
+    assert end.stop.startswith("step of")
+
+
 def test_en4dvar_of_a_nonlinear_field_minimises_the_cost():
     """J with the matrix ρ∘P written out, minimised by BFGS in the coordinates of its root; H reads sin of the field."""
     ensemble, data, read = small(nonlinear=0.9)

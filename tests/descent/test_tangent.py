@@ -10,6 +10,8 @@ from toys import Decay, make_problem
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.ensemble.tangent import Derivatives, check_derivatives
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import ProcessesExecutor
 from en4dvar.model.forward import Trajectory
@@ -125,6 +127,19 @@ def test_wrong_derivatives_are_refused_once_by_name(wrong, words):
     assert str(caught.value).count("derivatives") == 1
     assert str(caught.value).startswith("assimilation.linearisation")
     estimate(ten(wrong), linearisation="bundle", what_if=False)
+
+
+def test_right_derivatives_of_a_path_that_bends_within_a_short_step_are_taken():
+    """As over a long window of a chaotic model; a step of 1e-5 of the prior's width turns by one radian."""
+    a = Parameter("a", "1")
+    model = FunctionModel(
+        lambda p, t: np.sin(1e5 * p["a"] + t), [a], {"y": "1"},
+        jacobian=lambda p, t: {"a": 1e5 * np.cos(1e5 * p["a"] + t)},
+    )  # fmt: skip
+    data = Observations(TIMES, np.zeros(60), noise_of(np.ones(60)), np.ones(60))
+    problem = InverseProblem(model, model.observables[0], data, Prior((PriorTerm.normal(a, 0.3, 1.0),)))
+    composite, at = Composite(problem), np.array([0.3])
+    check_derivatives(problem, Derivatives(problem), at, composite)
 
 
 def test_a_tangent_is_asked_for_where_there_is_none():

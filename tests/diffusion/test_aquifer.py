@@ -36,6 +36,14 @@ def test_heads_between_strips_are_those_in_series():
     assert head[10] - head[9] == pytest.approx((c - 0.1) * (0.5 + 0.5 / 4), rel=5e-3)
 
 
+def test_a_clock_that_begins_before_the_model_moves_nothing_later():
+    aquifer, times = Aquifer((6, 5)), np.array([-1.0, 3.0, 9.0])
+    state = aquifer.initial_state(aquifer.defaults)[None]
+    (path,), (later,) = aquifer.trajectories(state, times), aquifer.trajectories(state, times[1:])
+    assert np.all(path["head"][0] == 0)
+    np.testing.assert_array_equal(path.states[1:], later.states)
+
+
 def test_the_state_goes_on_where_it_is():
     """A step from each instant to the next ends where the whole path ends."""
     aquifer = Aquifer((6, 5))

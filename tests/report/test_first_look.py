@@ -7,14 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import lognorm, norm, uniform
+from scipy.stats import beta, lognorm, norm, uniform
 
-from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
+from en4dvar import estimate
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.report.figures import histograms, neighbours
+from en4dvar.report.history import history
 from en4dvar.report.page import judge_chi2, render_set, trust
 from en4dvar.report.result import Result
 from en4dvar.results.scalars import SAMPLE_STATS
@@ -52,6 +54,14 @@ def test_the_prior_is_drawn_as_its_density_and_not_from_draws(analysis):
         assert x[-1] == pytest.approx(exact.ppf(norm.cdf(4)))
 
 
+def test_a_prior_with_values_that_are_a_bound_to_rounding_is_drawn(analysis):
+    x, density = densities(with_terms(analysis, PriorTerm.beta(Parameter("G", "Pa"), (0.0, 1.0), 1.0, 0.1)))[0]
+    assert np.all(np.isfinite(density))
+    inner = (x > 0.1) & (x < 0.99)
+    shape = beta(1.0, 0.1).pdf(x[inner])
+    np.testing.assert_allclose(density[inner] / density[inner][0], shape / shape[0], rtol=0.1)
+
+
 def test_a_result_of_before_shows_the_draws_that_it_holds(analysis):
     result = Result.from_analysis(analysis, {})
     group = result.groups["/sample_stats"]
@@ -59,6 +69,18 @@ def test_a_result_of_before_shows_the_draws_that_it_holds(analysis):
     old = Result({**result.groups, "/sample_stats": replace(group, variables=kept)})
     heights = np.unique(histograms(old).rows[0].panels[0].marks[0].top)
     assert len(heights) < 12  # steps
+
+
+def test_what_is_expected_of_a_single_reading_can_be_seen():
+    """A band at one instant has no width."""
+    prior = {"a": {"prior": "normal", "mean": 2, "std": 1}}
+    result = estimate(lambda p, t: p["a"] + 0 * t, ([3.0], [2.5]), prior, error=0.1, progress=False)
+    drawn = {mark.label: mark for mark in history(result).rows[0].panels[0].marks}
+    for label, members in (("prior 90 %", result.prior), ("posterior 90 %", result.posterior)):
+        ends = member_quantiles(members["a"].values, (0.05, 0.95))
+        assert drawn[label].kind == "bars"
+        np.testing.assert_allclose([*drawn[label].y, *drawn[label].top], ends, rtol=1e-9)
+    assert drawn["best fit"].kind == "dashes"
 
 
 @pytest.mark.parametrize("wide", [1, 1000])

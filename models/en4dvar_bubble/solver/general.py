@@ -19,6 +19,7 @@ Y_w = 1 − p_sat/p, its limit for large α, and is what diffuses away:
     D_w Y'_w + α √(R_v T_w/2π) R Y_w (p_sat/p − 1 + Y_w) = 0
 
 Medium (x = r/R ≥ 1, on a rational Chebyshev grid):  θ̇_m = V(x − x⁻²) θ_m' + D_m/R² ∇²θ_m + 12 ν V² x⁻⁶/(c_p T_∞)
+(ν that of −4νV in J, whatever it depends on: all the work of this stress is heat, none of that of the memory's).
 Wall: K_m θ_m' = K_∞ τ'_w + latent heat of the evaporating flux.
 
 Radial: enthalpy form and Gilmore with the Tait liquid, ρ = ((p+B)/(p_∞+B))^{1/n}:
@@ -105,7 +106,6 @@ def _contents(border, V, u, outward, eq, par, shared, out):
         hot = theta_w - 1.0
         store(shared, rows.FLOW, V)
         store(shared, rows.SPREAD, load(par, rows.MEDIUM_D) * per_area)
-        store(shared, rows.HEAT, load(par, rows.HEATING) * load(par, rows.VISCOSITY) * V * V)
         store(shared, rows.HOT, hot)
         outside = load(par, rows.MEDIUM_K) * (outward + hot * eq.medium[mM, mM])
         store(out, at, outside - slope_w - load(par, rows.LATENT) * p / theta_w * flux)
@@ -139,19 +139,18 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
         J = J + s
         J_rate = J_rate + change
     nu = load(par, rows.VISCOSITY)
-    dashpot = nu * V * 4.0
-    dashpot_V = nu * 4.0
+    nu_V = nu  # of νV by V
     if dims.shear:
         z = maximum(log(maximum(absolute(V) * 1e6, 1e-300)), viscous_span[0])
-        at = load(par, rows.VISCOUS_TABLE)
-        nu, nu_z, _ = lookup(eq.viscous, at, viscous_span, z)
-        dashpot = nu * V * 4.0
-        dashpot_V = (nu + nu_z) * 4.0
+        nu, nu_z, _ = lookup(eq.viscous, load(par, rows.VISCOUS_TABLE), viscous_span, z)
+        nu_V = nu + nu_z
     if dims.strain:
         nu, nu_x, _ = lookup(eq.viscous, load(par, rows.VISCOUS_TABLE), viscous_span, x)
-        dashpot = nu * V * 4.0
-        dashpot_V = nu * 4.0
+        nu_V = nu
         J_rate = J_rate - nu_x * V * V * 4.0
+    dashpot, dashpot_V = nu * V * 4.0, nu_V * 4.0
+    if wall:
+        store(shared, rows.HEAT, load(par, rows.HEATING) * nu * V * V)
 
     R = exp(u)
     ic = load(par, rows.INVERSE_C)
