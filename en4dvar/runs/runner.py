@@ -124,6 +124,8 @@ class EstimateKind(RunKind[Campaign]):
             else:
                 require_counted_once(config, files)
                 return
+        if len(refused) == 1:
+            raise refused[0]
         if faults := [fault for error in refused if isinstance(error, ConfigError) for fault in error.problems]:
             raise ConfigError(list(dict.fromkeys(faults)))
         raise DataError("\n".join(map(str, refused)))
