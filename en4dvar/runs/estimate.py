@@ -92,13 +92,15 @@ def estimate(
         {"column": "cell"}, "weights": [1, 0, 1]}``.
     correlation: of the errors of two series at equal times, ``{"prey": {"predator": 0.5}}``.
     window: as ``data.window`` of a file.
-    directory: of the run, with files and report as of :func:`en4dvar.run`; by default nothing is kept on disk.
+    name, seed: of the run, as in a file; members and draws follow from the seed.
+    directory: of the run, with files as of :func:`en4dvar.run`, and its page unless ``report`` is False; by default
+        nothing is kept on disk.
     force, resume: replace or continue the run in the directory.
     progress: show it on a terminal or in a notebook; or a function that is called as that of :func:`en4dvar.run`, with
         the name of the data set and the record of each iteration.
     cheap: ten thousand calls of a function take seconds, so that a doubt about the posterior is settled by sampling it.
-    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``;
-        ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
+    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``,
+        ``prior_correlation``; ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
 
     Raises
     ------
@@ -143,8 +145,8 @@ def estimate_sequence(
 
     Parameters
     ----------
-    model: with ``step`` or ``resumed``; data, priors, error, time, observable, series, correlation, directory, force,
-        resume: as of :func:`estimate`.
+    model: with ``step`` or ``resumed``; data, priors, error, time, observable, series, correlation, name, seed,
+        directory, report, force, resume: as of :func:`estimate`.
     initial_std: spread of the initial state by field, as ``sequence.initial_std`` of a file.
     sections: further sections of a file by name: ``assimilation`` (required), ``model_error``, ``execution``.
 
@@ -290,7 +292,7 @@ class GivenSeries:
                 matrix, times = _floats(value, f"error: {self._of()}{key}"), self.columns[TIME]
                 if matrix.shape != 2 * times.shape:
                     raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
-                if self.name:  # in a file with rows of other series
+                if self.name:  # in a file as long as the longest series
                     there = ~np.isnan(times + self.columns[self._readings(observable.name)])
                     matrix = matrix[there][:, there]
                 self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in matrix.tolist())
