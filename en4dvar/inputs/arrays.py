@@ -5,7 +5,9 @@ pandas and xarray objects are known by what they can do, so that neither need be
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -104,26 +106,12 @@ def _is_table(data: Any) -> bool:
     return isinstance(data, Mapping) or hasattr(data, "dims") or hasattr(data, "index")
 
 
-def stacked(tables: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
-    """One table of several that all have a column :data:`TIME`, their rows one below the other; NaN where one has none.
-
-    >>> stacked([{"time": np.array([1.0]), "u": np.array([2.0])}, {"time": np.array([0.5]), "v": np.array([3.0])}])
-    {'time': array([1. , 0.5]), 'u': array([ 2., nan]), 'v': array([nan,  3.])}
-    """
-    ends = np.cumsum([len(table[TIME]) for table in tables])
-    joined = {name: np.full(ends[-1], np.nan) for table in tables for name in table}
-    for table, end in zip(tables, ends, strict=True):
-        for name, column in table.items():
-            joined[name][end - len(column) : end] = column
-    return joined
-
-
 def csv_of(columns: Mapping[str, Array]) -> str:
-    """The columns as a CSV file that reads back to the bit."""
+    """The columns as a CSV file that reads back to the bit; shorter ones end in NaN."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([repr(float(x)) for x in row] for row in zip(*columns.values(), strict=True))
+    writer.writerows([repr(float(x)) for x in row] for row in zip_longest(*columns.values(), fillvalue=math.nan))
     return text.getvalue()
 
 

@@ -16,6 +16,7 @@ import unicodedata
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,7 @@ COMMENT = ("#", "%", "//")
 LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "#n/a", "-")
+MANY = 2000  # lines of a file whose cells are found once, whatever number of series it holds
 PREAMBLE = 200  # lines among which the names of the columns are looked for
 SEVERAL = 3  # lines of numbers that a table has at least, so that words below them are in its midst
 _SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
@@ -57,7 +59,13 @@ def scalars_in(path: Path) -> dict[str, float]:
 
 
 def _text(path: Path) -> str:
-    raw = read_plain(path, LONGEST)
+    if (text := _decoded(read_plain(path, LONGEST))) is None:
+        raise DataError(f"{path}: not a text file")
+    return text
+
+
+@lru_cache(1)  # each series of a file reads it
+def _decoded(raw: bytes) -> str | None:
     marked = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
     for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
         try:
@@ -66,7 +74,7 @@ def _text(path: Path) -> str:
             continue
         if not any(unicodedata.category(sign) == "Cc" for sign in {*text} - {*"\t\n\r\f\v\x1a\x85"}):
             return text
-    raise DataError(f"{path}: not a text file")
+    return None
 
 
 def delimiter_of(line: Line, path: Path) -> str:
@@ -85,10 +93,13 @@ def delimiter_of(line: Line, path: Path) -> str:
     return delimiter
 
 
-def cells_of(line: Line, delimiter: str) -> list[str]:
+def cells_of(line: Line, delimiter: str) -> Sequence[str]:
     """The cells of a line, those of a sheet as they are."""
-    if not isinstance(line, str):
-        return list(line)
+    return _parted(line, delimiter) if isinstance(line, str) else line
+
+
+@lru_cache(MANY)  # each series of a file has the same lines
+def _parted(line: str, delimiter: str) -> Sequence[str]:
     if not delimiter:
         return _BETWEEN_BLANKS.findall(line.strip())
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
@@ -118,7 +129,7 @@ class Table:
         others = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
         delimiter = next((s for s in others if s in line), delimiter_of(line, path))
         self.rows = [(n, cells_of(x, delimiter)) for n, x in lines[first:]]
-        below: list[list[str]] = []
+        below: list[Sequence[str]] = []
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
                 below.append(self.rows.pop(0)[1])

@@ -119,7 +119,7 @@ def compare_populations(
     populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are
     seen as a straight line of. ``known``: of a run medians that are known from elsewhere, {"G": "9.8 ± 0.3 kPa"},
     which calibrate what is common; they go before those of its configuration. One that is :data:`TOO_FAR` from what
-    its own data say calibrates nothing.
+    its own data say calibrates nothing. ``seed``: of the draws that a difference, a line and their intervals are of.
 
     Raises :class:`OutputError`: fewer than two, no population in a folder or one of an earlier version, no parameter of
     all of them, data sets that two of them hold, not a number for each or all the same, a name that nothing common has;

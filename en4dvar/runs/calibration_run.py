@@ -62,10 +62,12 @@ def calibrate(
     ``config`` and ``overrides``: as of :func:`en4dvar.run`. The data files say when readings are taken and how good
     they are; of several the sets take turns. ``made_with``: values for dotted keys with which the readings are made,
     though not estimated: another law, larger errors; it shows what a wrong assumption does to the intervals.
-    ``progress``: called with the number of sets that are done and of all.
+    ``progress``: called with the number of sets that are done and of all. ``force``: replace an earlier run in ``out``;
+    ``resume``: continue it. ``command``: what the user typed, for the file's history.
 
-    Raises :class:`ConfigError`, :class:`DataError`: the configuration cannot be used, or its readings and those
-    ``made_with`` other values are not at the same times. :class:`OutputError`: ``out`` cannot be used.
+    Raises :class:`ConfigError`, :class:`DataError`: the configuration cannot be used, ``sets`` are too few, or readings
+    and those ``made_with`` other values are not at the same times. :class:`OutputError`: ``out`` cannot be used.
+    :class:`En4dvarError`: all sets failed. Others as of :func:`en4dvar.run`.
     """
     if sets < FEWEST:
         raise ConfigError(f"{sets} sets tell nothing; give at least {FEWEST}, better 200")

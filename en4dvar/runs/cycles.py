@@ -42,6 +42,8 @@ def run_twin(
 ) -> TwinOutcome:
     """Conduct a twin experiment and write its run directory; arguments and errors as of :func:`en4dvar.run`.
     ``on_cycle`` is called with the number of each cycle, from 0.
+
+    Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
     kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)
     return TwinOutcome(**vars(conduct_run(kind, force, resume, command)))

@@ -20,7 +20,7 @@ from en4dvar.config.kinds import resolve_sequence
 from en4dvar.config.load import resolve
 from en4dvar.config.models import HANDED, checked, read_model
 from en4dvar.diagnosis.analysis import Progress
-from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
+from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, tables_of
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.function_model import FunctionModel, digest_of, name_of
 from en4dvar.model.state import OF_READINGS, Array, Parameter, floats
@@ -92,13 +92,15 @@ def estimate(
         {"column": "cell"}, "weights": [1, 0, 1]}``.
     correlation: of the errors of two series at equal times, ``{"prey": {"predator": 0.5}}``.
     window: as ``data.window`` of a file.
-    directory: of the run, with files and report as of :func:`en4dvar.run`; by default nothing is kept on disk.
+    name, seed: of the run, as in a file; members and draws follow from the seed.
+    directory: of the run, with files as of :func:`en4dvar.run`, and its page unless ``report`` is False; by default
+        nothing is kept on disk.
     force, resume: replace or continue the run in the directory.
     progress: show it on a terminal or in a notebook; or a function that is called as that of :func:`en4dvar.run`, with
         the name of the data set and the record of each iteration.
     cheap: ten thousand calls of a function take seconds, so that a doubt about the posterior is settled by sampling it.
-    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``;
-        ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
+    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``,
+        ``prior_correlation``; ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
 
     Raises
     ------
@@ -143,8 +145,8 @@ def estimate_sequence(
 
     Parameters
     ----------
-    model: with ``step`` or ``resumed``; data, priors, error, time, observable, series, correlation, directory, force,
-        resume: as of :func:`estimate`.
+    model: with ``step`` or ``resumed``; data, priors, error, time, observable, series, correlation, name, seed,
+        directory, report, force, resume: as of :func:`estimate`.
     initial_std: spread of the initial state by field, as ``sequence.initial_std`` of a file.
     sections: further sections of a file by name: ``assimilation`` (required), ``model_error``, ``execution``.
 
@@ -179,7 +181,7 @@ def _configured(
         try:
             yield replace(config, directory=where)
         except DataError as error:
-            raise DataError(call.words(str(error), where)) from None
+            raise DataError(call.words(error, where)) from None
 
 
 def _from_here(value: Any, key: Any = "") -> Any:
@@ -224,7 +226,7 @@ class GivenSeries:
     observable: str | None
     error: Any
     more: Mapping[str, Any]
-    used: dict[str, Array]
+    used: dict[str, Array] = field(default_factory=dict, init=False)
     files: dict[str, str] = field(default_factory=dict, init=False)
 
     def observed(self, known: Sequence[str]) -> str:
@@ -244,9 +246,10 @@ class GivenSeries:
         if name not in named:
             where = f"data: {self.name}" if self.name else "observable"
             raise ConfigError(f"{where}: the model has no {name!r}; it has: {', '.join(named)}")
+        clock = {"name": self._kept(TIME), "unit": model.time_unit}
         readings = {"name": self._kept(self._readings(name)), "unit": named[name].unit}
         return {
-            "columns": {TIME: {"name": TIME, "unit": model.time_unit}, name: readings},
+            "columns": {TIME: clock, name: readings},
             "error": {key: self._placed(value) for key, value in self._error(named[name]).items()},
             **{key: self._placed(value) for key, value in self.more.items()},
         }
@@ -289,7 +292,7 @@ class GivenSeries:
                 matrix, times = _floats(value, f"error: {self._of()}{key}"), self.columns[TIME]
                 if matrix.shape != 2 * times.shape:
                     raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
-                if self.name:  # in a file with rows of other series
+                if self.name:  # in a file as long as the longest series
                     there = ~np.isnan(times + self.columns[self._readings(observable.name)])
                     matrix = matrix[there][:, there]
                 self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in matrix.tolist())
@@ -351,7 +354,7 @@ class Given:
             chosen: Any = observable if self.alone else str(more.get("observable", name))
             with retold(DataError, DataError, f"data: {name}: " if name else "data: "):
                 columns = columns_of(table, time, chosen or _only(self.of_section[0] if self.of_section else model))
-            self.series.append(GivenSeries(name, columns, chosen, own, more, {TIME: columns[TIME]}))
+            self.series.append(GivenSeries(name, columns, chosen, own, more))
 
     def prior(self, section: Any) -> Any:
         """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
@@ -363,19 +366,14 @@ class Given:
         self.beside["data.prior.csv"] = csv_of(columns)
         return {**section, "ensemble": "data.prior.csv"}
 
-    def words(self, message: str, directory: Path) -> str:
-        """A ``message`` about the files in a directory as one about the arrays that they hold."""
+    def words(self, error: DataError, directory: Path) -> str:
+        """The message of an ``error`` about the files in a directory as one about the arrays that they hold."""
 
         def reading(row_of: re.Match[str]) -> str:
-            row = int(row_of[1]) - 2
-            for series in self.series:
-                if row < len(series.columns[TIME]):
-                    break
-                row -= len(series.columns[TIME])
-            return f"reading {row + 1} of {series.name or 'data'}"
+            return f"reading {int(row_of[1]) - 1} of {'data' if self.alone else error.series}"
 
         folder = re.escape(f"{directory.absolute()}")
-        message = re.sub(rf"{folder}.{re.escape(GIVEN)}:(\d+)", reading, message)
+        message = re.sub(rf"{folder}.{re.escape(GIVEN)}:(\d+)", reading, str(error))
         message = re.sub(rf"{folder}.data(?:\.(\S+))?\.csv", lambda file: file[1] or "data", message)
         return re.sub(r" \(data\.[^)]*\)|; see data\.\w+", "", message)
 
@@ -383,7 +381,8 @@ class Given:
     def files(self) -> dict[str, str]:
         """Names of the data file and of those beside it, and their texts."""
         beside = dict(item for series in self.series for item in series.files.items())
-        return {GIVEN: csv_of(stacked([series.used for series in self.series])), **beside, **self.beside}
+        columns = dict(item for series in self.series for item in series.used.items())  # names of series have no blank
+        return {GIVEN: csv_of(columns), **beside, **self.beside}
 
     def content(
         self, model: Any, name: str, seed: int, cheap: bool = False, **of_data: Any

@@ -69,7 +69,8 @@ def run_campaign(
     command: str = "",
     report_workers: int = 1,
 ) -> Campaign:
-    """As :func:`run`, for any number of data sets, each estimated by itself.
+    """As :func:`run`, for any number of data sets, each estimated by itself; other arguments and errors are those of
+    :func:`run`.
 
     A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
     ``Campaign.failures``, in ``summary.csv`` and in the log. Where the configuration shares parameters, all that have a
@@ -77,6 +78,9 @@ def run_campaign(
     (``population.nc``), or with its ``by:`` one of each group.
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
+
+    Raises :class:`ConfigError`, :class:`DataError` also where no data set can be used. One data set alone raises what
+    it failed with; of several, that all failed is no error.
     """
     kind = EstimateKind(loaded(config, load_config, overrides), resume, progress, report_workers)
     return conduct_run(kind, force, resume, command)
@@ -124,6 +128,8 @@ class EstimateKind(RunKind[Campaign]):
             else:
                 require_counted_once(config, files)
                 return
+        if len(refused) == 1:
+            raise refused[0]
         if faults := [fault for error in refused if isinstance(error, ConfigError) for fault in error.problems]:
             raise ConfigError(list(dict.fromkeys(faults)))
         raise DataError("\n".join(map(str, refused)))

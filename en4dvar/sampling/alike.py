@@ -16,11 +16,11 @@ POOL = 5  # times as many draws to choose from, and
 LEAST = 500  # at least so many
 
 
-def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covariance: Array) -> Array:
+def standing_for(x: Array, chosen: Indices, mean: Array, covariance: Array) -> Array:
     """(N, n) of equally likely draws ``x`` (D, n), of nearly this mean (n,) and covariance (n, n).
 
-    They are the ``chosen`` (N,) ones, exchanged for others of the same ``kind`` (D,) as long as that brings moments and
-    quantiles nearer to those of all. Where too few differ, the chosen ones.
+    They are the ``chosen`` (N,) ones, exchanged for others as long as that brings moments and quantiles nearer to those
+    of all. Where too few differ, the chosen ones.
     """
     n = x.shape[1]
     apart = x[chosen] - x[chosen].mean(axis=0)
@@ -40,7 +40,7 @@ def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covarian
         before = chosen.copy()
         for i, own in enumerate(chosen.tolist()):
             rest = total - off[own]
-            cost = np.where(kind == kind[own], size + 2 * off @ rest, np.inf)
+            cost = size + 2 * off @ rest
             best = int(np.argmin(cost))
             if cost[best] < cost[own] - 1e-9 * (cost[own] + rest @ rest):
                 chosen[i], total = best, rest + off[best]

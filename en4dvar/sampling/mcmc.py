@@ -75,8 +75,8 @@ class Chain:
         draws = np.asarray(self.samples[steps - 1 - (index * steps) // count, index % walkers])
         if not exact:
             return draws
-        alike, every = np.zeros(count, dtype=np.intp), np.arange(n_members) * count // n_members
-        return standing_for(draws, alike, every, self.flat.mean(axis=0), np.cov(self.flat.T))
+        every = np.arange(n_members) * count // n_members
+        return standing_for(draws, every, self.flat.mean(axis=0), np.cov(self.flat.T))
 
     def warning(self) -> str:
         return (

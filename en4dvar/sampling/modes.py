@@ -6,7 +6,7 @@ share of the evidence, whatever its shape.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class WeightedDraws:
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
         """(N, n) equally likely ones, of every mode as many as its weight says, to one.
 
-        ``exact``: nearly of the moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
+        ``exact``: of every mode nearly of the moments and quantiles of its draws, see :mod:`~en4dvar.sampling.alike`.
         """
         std = np.sqrt(np.diag(self.covariance)) + np.finfo(float).tiny  # over these, units do not matter
         vectors = np.linalg.eigh(self.covariance / np.outer(std, std))[1]
@@ -85,7 +85,13 @@ class WeightedDraws:
             return np.asarray(self.x[order[resampled(self.shares[order], count, stream)]])
         pool = order[resampled(self.shares[order], max(POOL * count, LEAST), stream)]
         every = ((np.arange(count) + 0.5) * len(pool) / count).astype(np.intp)
-        return standing_for(self.x[pool], self.mode[pool], every, self.mean, self.covariance)
+        chosen, of_each = np.split(every, np.flatnonzero(np.diff(self.mode[pool[every]])) + 1), list[Array]()
+        for own in chosen:
+            there = self.mode == self.mode[pool[own[0]]]
+            of_mode = replace(self, shares=self.shares * there / self.shares[there].sum())
+            begin, end = np.searchsorted(self.mode[pool], self.mode[pool[own[0]]] + np.arange(2))
+            of_each.append(standing_for(self.x[pool[begin:end]], own - begin, of_mode.mean, of_mode.covariance))
+        return np.concatenate(of_each)
 
 
 def sample_modes(

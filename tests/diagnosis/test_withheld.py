@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, norm
 from toys import OBSERVABLE, Vectorised, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
 
 import en4dvar
 from en4dvar.data.noise import Kernel, Predicted, noise_of
 from en4dvar.diagnosis.analysis import BEYOND_5
-from en4dvar.diagnosis.withheld import Withheld, independent_readings, predict_withheld
+from en4dvar.diagnosis.withheld import chance_of, predict_withheld
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -86,33 +86,33 @@ def test_bands_are_those_of_a_linear_model():
 def test_readings_that_err_for_themselves_are_counted_by_a_binomial():
     """Of equal members every reading counts, and the chance is that of another implementation of the binomial."""
     low, high = np.full(20, -BEYOND_5), np.full(20, BEYOND_5)
-    count = independent_readings(low, high, np.zeros((30, 20)), np.ones((30, 20)))
-    assert count == pytest.approx(20, rel=1e-9)
     for inside in (20, 17, 11):
-        values = np.where(np.arange(20) < inside, 0.0, 9.0)
-        withheld = Withheld(np.arange(20.0), values, low, np.zeros(20), high, 30, count)
-        assert withheld.chance == pytest.approx(binom.cdf(inside, 20, 0.9), rel=1e-6)
+        chance = chance_of(inside, low, high, np.zeros((30, 20)), np.ones((30, 20)))
+        assert chance == pytest.approx(binom.cdf(inside, 20, 2 * norm.cdf(BEYOND_5) - 1), rel=1e-6)
 
 
 def test_readings_that_err_together_count_as_one():
     """Members whose paths are parallel, far apart beside the errors: all readings of a path are inside, or none."""
     paths = np.repeat(np.linspace(-1.0, 1.0, 400)[:, None], 50, axis=1)
-    assert independent_readings(np.full(50, -0.9), np.full(50, 0.9), paths, np.full_like(paths, 1e-6)) == 1.0
+    chances = [chance_of(n, np.full(50, -0.9), np.full(50, 0.9), paths, np.full_like(paths, 1e-6)) for n in (0, 49, 50)]
+    assert chances == pytest.approx([0.1, 0.1, 1.0])
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("tilt", [0.0, 1.0, 3.0])
 def test_the_chance_is_that_of_readings_drawn_from_the_members(tilt):
-    """A part of the scatter is of the path, whose slope varies: the share of drawn readings inside scatters as of so
-    many independent ones.
+    """A part of the scatter is of the path, whose slope varies: as many draws as the chance says have no more readings
+    inside. A binomial of as much variance said 0.008 where 0.013 of them have.
     """
-    stream, t = np.random.default_rng(3), np.linspace(0, 1, 40)
-    mean = tilt * stream.standard_normal((2000, 1)) * t + 0.5 * tilt * stream.standard_normal((2000, 1))
-    spread = np.sqrt(1 + tilt**2 * (t**2 + 0.25))
+    stream, t = np.random.default_rng(3), np.linspace(0, 1, 10)
+    mean = tilt * (stream.standard_normal((20000, 1)) + stream.standard_normal((20000, 1)) * t)
+    spread = np.sqrt(1 + tilt**2 * (1 + t**2))
     low, high = -BEYOND_5 * spread, BEYOND_5 * spread
     drawn = mean + stream.standard_normal(mean.shape)
-    shares = np.mean((low <= drawn) & (drawn <= high), axis=1)
-    count = independent_readings(low, high, mean, np.ones_like(mean))
-    assert count == pytest.approx(0.09 / shares.var(), rel=0.15)
+    inside = np.sum((low <= drawn) & (drawn <= high), axis=1)
+    for count in (3, 5, 8):
+        share = np.mean(inside <= count)
+        error = 4 * np.sqrt(share / len(inside)) + 1e-4
+        assert chance_of(count, low, high, mean, np.ones_like(mean)) == pytest.approx(share, abs=error)
 
 
 class Twice(Ramp):

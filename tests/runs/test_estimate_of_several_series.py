@@ -11,6 +11,7 @@ import xarray as xr
 from problem.series_models import Two
 
 import en4dvar
+from en4dvar.inputs import text_table
 
 RNG = np.random.default_rng(3)
 T1, T2 = np.linspace(0.1, 1.0, 7), np.linspace(0.3, 1.5, 9)
@@ -36,6 +37,15 @@ def fit(model: Any = two, data: Any = None, **more: Any) -> en4dvar.Result:
 def test_a_reading_is_counted_in_its_series():
     with pytest.raises(en4dvar.DataError, match=r"reading 3 of q: times must increase, but 0\.3 follows 0\.45;"):
         fit(data={**DATA, "q": (np.where(T2[2] == T2, T2[0], T2), V2)})
+
+
+def test_a_file_of_series_is_as_long_as_the_longest_and_parsed_once(tmp_path):
+    """Rows stood below each other, and each series parsed all: time grew with the third power of their number."""
+    text_table._parted.cache_clear()
+    fit(directory=tmp_path / "run", report=False)
+    lines = (tmp_path / "run" / "data.csv").read_text().splitlines()
+    assert len(lines) == 1 + max(len(T1), len(T2))
+    assert text_table._parted.cache_info().misses <= len(lines)
 
 
 @pytest.mark.parametrize("several", [True, False])

@@ -144,7 +144,7 @@ def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[s
     return names[at], each
 
 
-def _lines(path: Path) -> list[list[str]]:
+def _lines(path: Path) -> list[Sequence[str]]:
     """Cells of a table whose first line names the columns. Raises :class:`DataError`."""
     with opened(path, ANY) as kind:
         if kind in VARIABLES:
