@@ -23,7 +23,7 @@ from typing import Literal
 from en4dvar.executor.processes import end_unguarded
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, replace_file, write_text
-from en4dvar.results.kinds import LISTING, lines_of_list
+from en4dvar.results.kinds import KINDS, LISTING, kind_named, lines_of_list
 from en4dvar.results.store import COMPLETE, NEXT, require_settled
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
@@ -34,7 +34,6 @@ PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a 
 LOG = "run.log"
 OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
-ENDS = ("calibration.csv", "sweep.csv")  # a run ends with one of these, or with netCDF
 BESIDE = re.compile(r"data(\..+)?\.csv")  # these, and further arrays
 Mode = Literal["new", "force", "resume", "report", "beside"]
 
@@ -197,7 +196,8 @@ def _occupied(path: Path, listed: Sequence[str]) -> str:
     if not listed:
         return f"{path}: not empty, and not of a run; {another}"
     held = [path / name for name in listed if "/" not in name and (path / name).is_file()]
-    ended = [file.stat().st_mtime for file in held if file.suffix == ".nc" or file.name in ENDS]
+    ends = [kind_named(name).result for name in KINDS]  # each written as a run ends
+    ended = [file.stat().st_mtime for file in held if file.suffix == ".nc" or file.name in ends]
     if not ended or (path / NEXT / LISTING).exists():
         return f"{path}: not empty: a run; --resume continues it if it has not ended, --force replaces it, {another}"
     when = datetime.fromtimestamp(max(ended)).strftime("%Y-%m-%d %H:%M")
