@@ -1,4 +1,4 @@
-"""Data sets over what they have in common, drawn."""
+"""Axes that are logarithmic: of data sets over what they have in common, and of what varies in time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from en4dvar.report import figures, responses
 from en4dvar.report.together import forest
 
 ABOUT = {"units": "1", "display_units": "1", "symbol": "x"}
@@ -22,3 +23,13 @@ def test_an_interval_that_reaches_below_zero_is_drawn(lowest, logarithmic):
     ((panel,),) = (row.panels for row in forest(groups, ("a", "b"), {"x": draws}).rows)
     assert panel.x_logarithmic == logarithmic
     assert panel.limits()[0][0] < panel.marks[0].x[0]
+
+
+@pytest.mark.parametrize(("lowest", "logarithmic"), [(0.02, True), (-1.0, False)])
+def test_a_prior_that_reaches_below_zero_is_drawn_below_what_varies(monkeypatch, lowest, logarithmic):
+    posterior, prior = np.array([[0.1], [0.12], [0.15]]), np.array([[lowest], [1.0], [3.0]])
+    walk = figures.StoredWalk("k", "rate", "k", "1", "s", np.array([0.0, 1.0]), posterior, prior)
+    monkeypatch.setattr(figures, "stored_walks", lambda result: (walk,))
+    monkeypatch.setattr(responses, "time_label", lambda result: "time")
+    (((panel,),),) = ((row.panels for row in figures.bands(None).rows),)
+    assert panel.logarithmic == logarithmic
