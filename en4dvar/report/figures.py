@@ -329,7 +329,7 @@ def bands(result: StoredResult) -> Chart:
     rows = []
     for walk in stored_walks(result):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
-        steep = least > 0 and math.isfinite(most) and most > 5 * least
+        steep = min(least, np.nanmin(walk.prior)) > 0 and math.isfinite(most) and most > 5 * least
         labels = responses.time_label(result), with_unit(walk.symbol, walk.unit)
         panel = Panel(*labels, logarithmic=steep, legend=True)
         for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):

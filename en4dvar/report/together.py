@@ -152,7 +152,8 @@ def forest(
                 panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
             else:
                 panel.dots(middle[has], -has - 0.3, "centre", 3.0, kind="rings")
-        panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
+        least = min(np.nanmin(mark.x) for mark in panel.marks if mark.x.size)
+        panel.x_logarithmic = bool(least > 0 and rows[has].max() > 20 * rows[has].min())
         panels.append(panel)
     return in_columns(panels, (2.0 + 0.36 * min(count, 60)) * POINTS)
 
