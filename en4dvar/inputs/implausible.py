@@ -30,16 +30,17 @@ from en4dvar.plumbing.units import convert
 WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
 MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
-OUTLYING = 8.0  # standard deviations from what its neighbours say
+OUTLYING = 5.0  # standard deviations from what its neighbours say
+ROUGH = 10.0  # standard deviations of these neighbours about a parabola, small since they were chosen to lie on one
+NEAR, AGREEING = 8, 6  # neighbours, and how many of them speak
 RARE = 0.2  # of all readings: a number that stands for none
-IN_A_ROW = 3  # readings that are judged together
+IN_A_ROW = 3  # readings at least of a plateau
 FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
 BESIDE = 4  # readings to either side of a plateau, or half as many as it has
 CUT = 5.0  # standard deviations by which they lead higher: of 5500 tops that are rounded none comes above 3.5
 LEVELS = np.linspace(0.99, 0.7, 15)  # of the largest reading: where the search for a level top begins
 ROUNDS = 6  # of the search from there
 POWER = 2.5  # of a radius, which is a parabola in time about its maximum
-ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
 
 
 def scatter_of(times: Array, values: Array) -> float:
@@ -67,35 +68,47 @@ def _rounding(values: Array) -> float:
 
 
 def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_]:
-    """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have.
+    """Which readings (K,) are far from what their neighbours say, with ``scatter`` as errors have.
 
-    Up to three in a row are judged together. Readings below neighbours that fall towards them from both sides are the
-    bottom of a collapse; several that move no farther than their neighbours do are an oscillation. Of the first three,
-    each is judged by six behind it, and odd if it is above all of these: glare of a laser.
+    Of the eight nearest those six speak that lie best on a parabola, for two of them may be wild as well (least trimmed
+    squares: Rousseeuw 1984, J. Am. Stat. Assoc. 79, 871; all parabolas through three are tried). Below half of the
+    largest reading, where a bubble collapses and rebounds, a reading has to be farther off than these six differ. One
+    below neighbours that fall towards it from both sides is the bottom of a collapse. At the ends a reading is odd if
+    it is above all of them: glare of a laser. Wild readings make the scatter seem larger than it is, so that without
+    those that were found it is asked again.
     """
-    odd = np.zeros(len(values), dtype=bool)
-    for count in range(1, min(IN_A_ROW, len(values) - len(ASIDE)) + 1):
-        t, r = (sliding_window_view(it, len(ASIDE) + count) for it in (times, values))
-        near, here = r[:, ASIDE], r[:, 3:-3]
-        expected, spread = _fitted(t, ASIDE, 2, near)
-        rough = np.sqrt(2 * np.mean((near - expected[:, ASIDE]) ** 2, axis=1))  # of 6 readings and 3 coefficients
-        off = here - expected[:, 3:-3]
-        far = np.abs(off) > OUTLYING * spread[:, 3:-3] * np.maximum(scatter, rough)[:, None]
-        if count > 1:
-            far &= (np.abs(off) > np.ptp(near, axis=1)[:, None]) & (np.sign(off) == np.sign(off[:, :1]))
-        steep = (near.min(axis=1) < STEEP * near.max(axis=1)) | (here.min(axis=1) < 0.2 * near.min(axis=1))
-        falls = near[:, [0, 5]].mean(axis=1) - near[:, [2, 3]].mean(axis=1) > FALLS * scatter
-        for first in np.flatnonzero(far.all(axis=1) & ~steep & ~(falls & (off[:, 0] < 0))):
-            odd[first + 3 : first + 3 + count] = True
-    for number in range(IN_A_ROW - 1, -1, -1):  # the last of them first: what is odd judges no other
-        behind = number + 1 + np.flatnonzero(~odd[number + 1 : number + 1 + IN_A_ROW + len(ASIDE)])[: len(ASIDE)]
-        if len(behind) == len(ASIDE) and values[behind].min() > STEEP * values[behind].max():
-            until = behind[-1] + 1
-            fitted = _fitted(times[None, number:until], behind - number, 2, values[None, behind])
-            expected, spread = (np.concatenate([np.zeros(number), it[0]]) for it in fitted)
-            rough = math.sqrt(2 * np.mean((values[behind] - expected[behind]) ** 2))
-            far = values[number] - expected[number] > OUTLYING * spread[number] * max(scatter, rough)
-            odd[number] |= far and values[number] > values[behind].max()
+    odd, own = np.zeros(len(values), dtype=bool), np.arange(len(values))
+    if len(values) <= NEAR:
+        return odd
+    near = np.clip(own - NEAR // 2, 0, len(values) - NEAR - 1)[:, None] + np.arange(NEAR)
+    near += near >= own[:, None]
+    t, r, least = times[near] - times[:, None], values[near], np.full(len(values), np.inf)
+    best = np.tile(np.arange(AGREEING), (len(values), 1))
+    for a, b, c in itertools.combinations(range(NEAR), 3):
+        with np.errstate(all="ignore"):  # of bounds at one time
+            slope, other = ((r[:, it] - r[:, a]) / (t[:, it] - t[:, a]) for it in (b, c))
+            bend = (other - slope) / (t[:, c] - t[:, b])
+            curve = slope[:, None] + bend[:, None] * (t - t[:, [b]])
+            squares = (r - r[:, [a]] - (t - t[:, [a]]) * curve) ** 2
+        closest = np.argsort(squares, axis=1)[:, :AGREEING]
+        total = np.take_along_axis(squares, closest, axis=1).sum(axis=1)
+        better = total < least
+        least[better], best[better] = total[better], closest[better]
+    best.sort(axis=1)
+    t, r = (np.take_along_axis(it, best, axis=1) for it in (t, r))
+    expected, spread = _fitted(np.column_stack([t, 0 * times]), np.arange(AGREEING), 2, r)
+    rough = np.sqrt(np.sum((r - expected[:, :-1]) ** 2, axis=1) / (AGREEING - 3))
+    off, low = values - expected[:, -1], np.maximum(values, expected[:, -1]) <= STEEP * values.max()
+    far = np.abs(off) > spread[:, -1] * np.maximum(OUTLYING * scatter, np.where(low, 2, 1) * ROUGH * rough)
+    steep = (r.min(axis=1) < STEEP * r.max(axis=1)) | (values < 0.2 * r.min(axis=1))
+    before = np.sum(t < 0, axis=1)
+    inner = np.clip(before, 1, AGREEING - 1)
+    falls = r[:, [0, -1]].mean(axis=1) - 0.5 * (r[own, inner - 1] + r[own, inner]) > FALLS * scatter
+    between = (np.minimum(before, AGREEING - before) > 0) & ~(falls & (off < 0))
+    fits = np.where(low, between & (np.abs(off) > np.ptp(r, axis=1)), between | (values > r.max(axis=1)))
+    odd[far & ~steep & fits] = True
+    if odd.any():
+        odd[~odd] = outlying(times[~odd], values[~odd], scatter_of(times[~odd], values[~odd]))
     return odd
 
 

@@ -43,6 +43,7 @@ from en4dvar_bubble.medium import Medium
 RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
 LOWEST = (0.4, 0.6, 0.75)  # of R_max: R^{5/2} is fitted to what lies above, to less where a thick gel lets it creep
 KNOWN = "write a configuration whose priors say what is known of it (en4dvar init --start laser, without --data)"
+WILD = "delete the line of that reading if it is wild"
 BEFORE = 1.0  # of the time that is fitted to: a parabola whose top lies further before the first sample shows none
 TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
@@ -106,14 +107,15 @@ def lobe(times: Array, radius: Array) -> Lobe:
         if near:
             break
     if turning is None:
-        top = f"its maximum, reading {np.argmax(radius) + 1} of {len(radius)}"
+        largest = int(np.argmax(radius))
+        top = f"its maximum at {1e6 * times[largest]:.6g} us, reading {largest + 1} of {len(radius)}"
         if where.stop - where.start < 4 and lowest == LOWEST[0]:
             words = f"fewer than four samples from {top}, down to its collapse; is this a radius history?"
-            raise DataError(f"{words} Where it is, {KNOWN}")
+            raise DataError(f"{words} Where it is, {WILD}, or {KNOWN}")
         raise DataError(
             f"the radius does not turn at {top}, but creeps from there as in a thick gel, where G, mu and the time of "
-            "the true maximum make up for each other; give the readings before it as well, or, where there are none, "
-            f"{KNOWN}"
+            f"the true maximum make up for each other; {WILD}, give the readings before it as well, or, where there "
+            f"are none, {KNOWN}"
         )
     return turning
 

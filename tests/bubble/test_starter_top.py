@@ -87,6 +87,18 @@ def test_readings_that_are_none_are_told_and_not_taken_for_the_top(count: int) -
     assert look(t[~odd], 1e-4 * r[~odd]).top.height == pytest.approx(1e-4, rel=0.02)
 
 
+@pytest.mark.parametrize("by", [(-0.4, 0.3, 0.25, -0.2), (0.3, 0.35, 0.25, -0.2), (0.2, -0.4, -0.25, 0.5)])
+def test_wild_readings_among_wild_ones_are_told_and_no_others(by: tuple[float, ...]) -> None:
+    """One in five of those about the top, so that a neighbour of each is wild, too, and the scatter seems larger."""
+    for seed in range(8):
+        t, r = history(np.random.default_rng(seed), 30, 0.01, 0.8)
+        wild = int(np.argmin(np.abs(t))) + np.array([-7, -5, 1, 4])
+        r[wild] += by
+        odd = outlying(t, r, scatter_of(t, r))
+        assert np.flatnonzero(odd).tolist() == wild.tolist()
+        assert look(t[~odd], 1e-4 * r[~odd]).top.height == pytest.approx(1e-4, rel=0.02)
+
+
 @pytest.mark.parametrize("per_collapse", [15, 30])
 @pytest.mark.parametrize("ceiling", [0.9, 0.94])
 def test_a_top_that_is_cut_off_is_told_and_its_height_is_that_of_the_sides(per_collapse: float, ceiling: float) -> None:
