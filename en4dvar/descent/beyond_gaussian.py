@@ -177,10 +177,10 @@ def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: flo
     else, cut off softly. None where none is.
 
     About a minimum of J the curvature of a bound is that of a Gaussian on one side and zero on the other, so no
-    Gaussian is near. With the predictions linear about it, all but the bounds is a Gaussian in closed form; from its
-    draws the bounds are imposed by degrees (sequential Monte Carlo: Del Moral, Doucet & Jasra 2006, J. R. Stat. Soc. B
-    68, 411), with elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which needs no run of the
-    model.
+    Gaussian is near. With the predictions linear about it, all but the bounds is a Gaussian in closed form; on its
+    draws, moved to the mode, the bounds are imposed by degrees (sequential Monte Carlo: Del Moral, Doucet & Jasra 2006,
+    J. R. Stat. Soc. B 68, 411), with elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which
+    needs no run of the model.
     """
     observations, basis = space.problem.observations, space.basis
     sides = sides_of(observations.noise)
@@ -206,10 +206,15 @@ def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: flo
         """J_o (B,) of the bounds alone."""
         return noise.cost(values, weights, Predicted(at + moved(z) @ slopes))
 
-    stream, mode = member_stream(space.seed, "bounds"), (root @ -middle)[None]
-    lowest = cost - float(of_bounds(mode)[0]) - 0.5 * float(np.sum(mode**2))  # J of all else at its own minimum
-    z, log_share = _imposed(stream.standard_normal((max(PARTICLES, n_members), r)), of_bounds, stream)
-    z = z[:n_members]
+    stream, mode = member_stream(space.seed, "bounds"), root @ -middle
+
+    def of_shifted(v: Array) -> Array:
+        """What N(mode, I), where the posterior is, needs to be N(0, I) with the bounds, at v (B, r) from the mode."""
+        return np.asarray(of_bounds(mode + v) + v @ mode + 0.5 * mode @ mode)
+
+    lowest = cost - float(of_shifted(np.zeros((1, r)))[0])  # J of all else at its own minimum
+    v, log_share = _imposed(stream.standard_normal((max(PARTICLES, n_members), r)), of_shifted, stream)
+    z = mode + v[:n_members]
     log_det = 2 * float(np.log(np.abs(np.diag(root)) / prior).sum())
 
     def cost_of(x: Array) -> Array:
