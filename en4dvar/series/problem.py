@@ -17,7 +17,7 @@ from en4dvar.series.series import CycleSeries, aligned
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
 
-UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a warning, or its inverse, beyond chance
+TOO_SURE, TOO_WIDE = 1.2, 1 / 1.5  # root mean square of normalised innovations that is told, beyond chance
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class SeriesResult:
         squares = self.normalised[np.isfinite(self.normalised)] ** 2
         size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
         low, high = np.sqrt(np.array(chi2_interval(float(len(squares)))) / max(1, len(squares)))
-        if size > max(UNEXPECTED, high):
+        if size > max(TOO_SURE, high):
             told.append(
                 f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
                 "itself; give model_error, inflation or larger errors"
             )
-        if size < min(1 / UNEXPECTED, low):
+        if size < min(TOO_WIDE, low):
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
 

@@ -105,3 +105,13 @@ def test_errors_that_are_far_too_large_or_small_are_told(factor, words):
     read = READ + 0.1 * np.random.default_rng(1).standard_normal(8)
     (told,) = followed(Swing, "etkf", 8, read=(TIMES, read), error=0.1 * factor).warnings
     assert words in told
+
+
+@pytest.mark.parametrize("stated", [0.75, 1.0])
+def test_innovations_a_third_too_large_are_told_where_they_are_many(stated):
+    """Of 400 readings a root mean square of 1.33 is no chance, as of a filter that has become too sure: 1.2 is told."""
+    when = 0.05 * np.arange(1, 401)
+    read = np.array([(expm(SLOPE * t) @ [1, 0])[0] for t in when]) + 0.1 * np.random.default_rng(7).standard_normal(400)
+    told = followed(Swing, "etkf", 8, read=(when, read), error=0.1 * stated).warnings
+    assert [words for words in told if "too sure of" in words] == list(told)
+    assert len(told) == (stated < 1)
