@@ -32,6 +32,7 @@ from en4dvar.problem import InverseProblem
 BAND = (0.05, 0.95)
 SEEN, FEWEST = 0.6, 5  # the share in their bands, of so many readings or more, below which the estimate is doubted
 BISECTIONS = 50
+MANY = 500  # readings: an exact sum takes a time that grows with their square
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,13 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
 
 
 def chance_of(inside: int, low: Array, high: Array, mean: Array, std: Array) -> float:
-    """That no more than so many readings lie in bands (K,), by what each of the members (M, K) expects."""
+    """That no more than so many readings lie in bands (K,), by what each of the members (M, K) expects. A sum of more
+    than :data:`MANY` coins is taken for Gaussian.
+    """
     own = ndtr((high - mean) / std) - ndtr((low - mean) / std)
+    if own.shape[1] > MANY:
+        spread = np.sqrt(np.sum(own * (1 - own), axis=1)) + np.finfo(float).tiny
+        return float(ndtr((inside + 0.5 - own.sum(axis=1)) / spread).mean())
     counts = np.eye(1, own.shape[1] + 1).repeat(len(own), axis=0)  # of each member, that so many of the first k do
     for q in own.T[..., None]:
         counts = (1 - q) * counts + q * np.roll(counts, 1, axis=1)

@@ -83,12 +83,13 @@ def test_bands_are_those_of_a_linear_model():
     assert a.withheld.high - a.withheld.low == pytest.approx(2 * 1.645 * std, rel=0.02)
 
 
-def test_readings_that_err_for_themselves_are_counted_by_a_binomial():
+@pytest.mark.parametrize(("count", "error"), [(20, 1e-7), (600, 5e-3)])  # many are taken for Gaussian
+def test_readings_that_err_for_themselves_are_counted_by_a_binomial(count, error):
     """Of equal members every reading counts, and the chance is that of another implementation of the binomial."""
-    low, high = np.full(20, -BEYOND_5), np.full(20, BEYOND_5)
-    for inside in (20, 17, 11):
-        chance = chance_of(inside, low, high, np.zeros((30, 20)), np.ones((30, 20)))
-        assert chance == pytest.approx(binom.cdf(inside, 20, 2 * norm.cdf(BEYOND_5) - 1), rel=1e-6)
+    low, high = np.full(count, -BEYOND_5), np.full(count, BEYOND_5)
+    for inside in (count, round(0.88 * count), round(0.55 * count)):
+        chance = chance_of(inside, low, high, np.zeros((30, count)), np.ones((30, count)))
+        assert chance == pytest.approx(binom.cdf(inside, count, 2 * norm.cdf(BEYOND_5) - 1), abs=error)
 
 
 def test_readings_that_err_together_count_as_one():
