@@ -381,6 +381,19 @@ def test_a_wrong_reading_is_no_error_of_the_times():
         assert analysis.timing == 0.0
 
 
+def test_wrong_readings_beside_a_discrepancy_may_count_less():
+    """Its advice was to delete one line after another; a robust cost stands beside a discrepancy, not a correlation."""
+    p = make_problem(Wave(), (1.0, 2.0), k=50, std=0.02, scale=0.3)
+    values = np.array([p.model.curve(np.array([1.0, 2.0]), time) for time in p.observations.times])
+    values += 0.02 * np.random.default_rng(0).standard_normal(50)
+    values[[12, 30]] += [0.5, -0.4]
+    p = read(p, values=values)
+    correlated = replace(p, observations=with_noise(p.observations, correlation=np.eye(50)))
+    for problem, less in ((with_discrepancy(p, amplitude=(0.02, 1.5), length=(0.2, 0.7)), True), (correlated, False)):
+        advice = [c.advice for c in run(problem).cautions if c.words.startswith("the reading at")]
+        assert ["data.error.robust: huber such readings count less" in it for it in advice] == [less]
+
+
 @pytest.mark.slow
 def test_errors_of_the_times_that_are_stated_too_large_are_named():
     """Of a clock that keeps time; an exposure is asked for where nothing is said of times."""

@@ -72,7 +72,7 @@ class Case:
     @property
     def may_be_robust(self) -> bool:
         noise = self.a.observations.noise
-        return noise.independent and not math.isfinite(noise.counts_within)
+        return not noise.matrices() and not math.isfinite(noise.counts_within)  # also beside a discrepancy
 
     @property
     def cause(self) -> str:
@@ -253,7 +253,8 @@ def _odd(case: Case) -> str:
         other = _structure(case) if noise.discrepant else "the model errs where the observable changes fast"
         return other if case.exact else f"{first} data.error.time_std; if the times are right, {other}"
     if case.may_be_robust:
-        return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
+        option = case.with_scheme("data.error.robust: huber")
+        return f"look at this reading; with {option} such readings count less{case.or_times}"
     return f"look at this reading; if it is wrong, delete its line from the data file and say so{case.or_times}"
 
 
