@@ -54,8 +54,8 @@ class Document:
     def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
         """A fault at ``path``, or at its nearest ancestor that is written in the file."""
         dotted, message = brief(_dotted(path), 200), brief(message)
-        below = [origin for key, origin in self.origins.items() if len(path) > 1 and key[: len(path)] == tuple(path)]
-        if below:  # of what an option has set inside
+        below = [origin for key, origin in self.origins.items() if path and key[: len(path)] == tuple(path)]
+        if below and (len(path) > 1 or tuple(path) not in self.keys):  # of what an option has set inside
             return Fault(message, dotted, below[0])
         for n in range(len(path), -1, -1):
             key = tuple(path[:n])

@@ -28,7 +28,7 @@ from en4dvar.executor import Executor
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
+from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, retold
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
@@ -77,7 +77,8 @@ def calibrate(
         if idle := [key for key in made_with if key.split(".")[0] in NOT_OF_READINGS]:
             raise ConfigError(f"--made-with {idle[0]}: has no part in making readings; --set changes it")
         document, base = document_from(config, overrides)
-        made = resolve(override(document, made_with, "--made-with"), base)
+        with retold(ConfigError, ConfigError, "with what --made-with changes: "):
+            made = resolve(override(document, made_with, "--made-with"), base)
         changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}})
     path = Path(out) if out else own.directory.with_name(f"{own.directory.name}_calibration")
     own = replace(own, directory=path, resolved=own.resolved + indent(changed, "# "))

@@ -97,7 +97,8 @@ def run_design(
     """
     document, base = document_from(source, overrides)
     if after is not None:
-        document = override(document, _known(document, base, after), "--after")
+        known = _known(document, base, after)
+        document = override(document, known, "--after", dict.fromkeys(known, "--after"))
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))

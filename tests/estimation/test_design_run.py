@@ -413,7 +413,7 @@ def test_after_a_run_there_is_less_to_learn(tmp_path):
     one, other, both = (found.rows[0].result.gain for found in (before, next_one, twice))
     assert other < 0.5 < 1.5 < one
     assert one + other == pytest.approx(both, abs=0.02)
-    with pytest.raises(En4dvarError, match=r"^--after prior\.ensemble: .*nowhere: no such file"):
+    with pytest.raises(En4dvarError, match=r"^--after: .*nowhere: no such file"):
         run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")
 
 

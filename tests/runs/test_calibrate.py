@@ -209,6 +209,8 @@ def test_what_cannot_be_done_is_told(toy, tmp_path):
         sixty(toy, tmp_path / "out", made_with={"data.windo": 3})
     with pytest.raises(ConfigError, match=r"--made-with seed: has no part in making readings"):
         sixty(toy, tmp_path / "out", made_with={"seed": 3})
+    with pytest.raises(ConfigError, match=r"^with what --made-with changes: --made-with modl\.name: modl: unknown key"):
+        sixty(toy, tmp_path / "out", made_with={"modl.name": "toy"})
     (tmp_path / "out").mkdir(exist_ok=True)
     (tmp_path / "out" / "calibration.csv").write_text("set,data_set\n1,\n")
     with pytest.raises(OutputError, match="not a table of 'en4dvar calibrate'"):
