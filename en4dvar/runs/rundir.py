@@ -81,7 +81,7 @@ class RunDirectory:
                 elif not resumed:
                     directory._refuse_foreign((*OF_EVERY_RUN, *files))
                     write_list(directory.work, ())
-                elif mode == "resume" and not {*files}.intersection(lines_of_list(work)):
+                elif mode == "resume" and files and not {*files}.intersection(lines_of_list(work)):
                     for name in lines_of_list(work):
                         if not (name in OF_EVERY_RUN or "/" in name or BESIDE.fullmatch(name)):
                             raise OutputError(f"{path}: holds {name} of another command; give another --out")

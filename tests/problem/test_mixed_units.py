@@ -99,9 +99,9 @@ def test_a_smoother_takes_every_variable_back(widened):
 
 def test_few_draws_stand_for_all_in_any_units():
     stream = np.random.default_rng(2)
-    x, kind = stream.standard_normal((400, 3)), np.zeros(400, dtype=np.intp)
+    x = stream.standard_normal((400, 3))
     alike, mixed = (
-        standing_for(x * sizes, kind, np.arange(48), x.mean(axis=0) * sizes, np.cov((x * sizes).T)) / sizes
+        standing_for(x * sizes, np.arange(48), x.mean(axis=0) * sizes, np.cov((x * sizes).T)) / sizes
         for sizes in (np.ones(3), SIZES)
     )
     assert not np.array_equal(alike, x[:48])  # some are exchanged
