@@ -97,16 +97,20 @@ def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
 
     So is one on its slope, where J exceeds that of the lower one by half of what the Gaussian about it has there.
     """
-    distinct: list[Minimum] = []
+    places: list[list[Minimum]] = []  # of each the lowest first
     for minimum in sorted(minima, key=lambda minimum: minimum.cost):
-        for place, lower in enumerate(distinct):
-            distance = lower.distance(minimum.x)
-            on_slope = distance < SLOPE and minimum.cost - lower.cost > 0.25 * distance**2
+        for place in places:
+            distance = place[0].distance(minimum.x)
+            on_slope = distance < SLOPE and minimum.cost - place[0].cost > 0.25 * distance**2
             if distance < REACHED or on_slope:
-                spread = max(lower.spread, minimum.cost + minimum.spread - lower.cost)
-                members = tuple(sorted({*lower.members, *minimum.members}))
-                distinct[place] = replace(lower, members=members, spread=spread)
+                place.append(minimum)
                 break
         else:
-            distinct.append(minimum)
-    return tuple(distinct)
+            places.append([minimum])
+    return tuple(_as_one(*place) if len(place) > 1 else place[0] for place in places)
+
+
+def _as_one(lowest: Minimum, *others: Minimum) -> Minimum:
+    spread = max(lowest.spread, *(minimum.cost + minimum.spread - lowest.cost for minimum in others))
+    members = {*lowest.members, *(member for minimum in others for member in minimum.members)}
+    return replace(lowest, members=tuple(sorted(members)), spread=spread)
