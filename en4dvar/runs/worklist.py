@@ -349,7 +349,6 @@ class Worklist:
         """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
         removed, never written in place. To look at each for a link is a tenth of what a data set costs this process.
         """
-        # the folder was looked at as the run began; to look at each file for a link takes a tenth of the work here
         return self.run.directory.work / d.iteration
 
     def _hear_one(self, problem: InverseProblem, name: str, record: Record) -> None:
