@@ -32,6 +32,7 @@ NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
 WALKERS, MOVES = 600, 20  # they are drawn by their weights, and move about where they were so many moves before;
 RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
 FIRST_TURNS, TURNS = 10, 3  # both so often
+STILL = 1e-4  # of the logarithm of a ratio of two integrals from turn to turn
 HALF = 0.5  # of the walkers stay effective from a density to the next
 HIGHEST = 8  # degree of polynomials, where runs are many
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
@@ -145,7 +146,7 @@ class EmulatedProposal:
         tried = np.concatenate([z, mixture.draw(RENEWED * WALKERS, stream)])
         logs = (-self.cost(tried) - mixture.log_density(tried)).reshape(1 + RENEWED, WALKERS)
         best = np.argmax(logs + stream.gumbel(size=logs.shape), axis=0)
-        log = float(np.logaddexp.reduce(logs[1:], axis=None)) - np.log(RENEWED * WALKERS)
+        log = log_ratio(logs[1:].ravel(), logs[0])
         walkers = tried.reshape(1 + RENEWED, WALKERS, -1)[best, np.arange(WALKERS)]
         return replace(self, mixture=mixture, walkers=walkers, log=log)
 
@@ -156,6 +157,23 @@ class EmulatedProposal:
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, n)."""
         return np.asarray(-self.cost(x) - self.log)
+
+
+def log_ratio(of_first: Array, of_second: Array) -> float:
+    """ln of ∫ of a second density over that of a first, from the logarithms of second over first at draws of the first
+    (D,) and of the second (W,).
+
+    Where the first is thin in a tail of the second, the mean over its draws alone is that of a few; draws of the second
+    are there. Source: bridge sampling, Meng & Wong (1996), Stat. Sinica 6, 831.
+    """
+    counts = np.log([len(of_first), len(of_second)])
+    first, second = counts - np.logaddexp(*counts)
+    log = change = 1.0
+    while abs(change) > STILL:
+        at_first, at_second = (np.logaddexp(first, second + of - log) for of in (of_first, of_second))
+        change = np.logaddexp.reduce(of_first - log - at_first) - np.logaddexp.reduce(-at_second) - first + second
+        log += change
+    return float(log)
 
 
 def _moved(cost: Callable[[Array], Array], z: Array, others: Array, stream: np.random.Generator) -> Array:

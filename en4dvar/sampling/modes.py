@@ -30,7 +30,7 @@ LAST_RUNS = 30.0  # for each, as long as too few are effective
 CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
 WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to half too small
 FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
-THIN = 0.15  # effective share of draws of a mixture below which the posterior is drawn by an emulator
+THIN = 0.25  # effective share of draws of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
 ALONG, NEAR, VALLEY = np.linspace(0, 1, 17), 0.125, 0.5  # windows between modes, and the share of draws of a valley
 BESIDE, GAP, NOTHING, LOOKED = 5, 4.0, 0.005, 20  # draws beside a gap, its width, the share in all gaps, how many
@@ -129,7 +129,7 @@ def sample_modes(
         sampler, rounds = FixedDraws(mixture, first.stream, DRAWS), rounds + 1
         going = more(sampler)
     while going and unsettled() and rounds < most:
-        if runs and sampler.effective < THIN * len(sampler.z):
+        if runs and (not first.near or sampler.effective < THIN * len(sampler.z)):
             sampler, mixture, going = _guided(runs, sampler, mixture, more)
             runs = None
         else:
