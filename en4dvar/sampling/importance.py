@@ -30,14 +30,14 @@ class Importance:
     """The draws of one data set from its proposals, ``count`` in a round, the first of them from ``first``.
 
     ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
-    of draws behind it.
+    of draws behind it. ``settled``: whether rounds that trained the proposal had stopped to reach farther.
     """
 
     def __init__(self, first: Proposal, stream: np.random.Generator, count: int):
         self.stream, self.count = stream, count
         self.proposals: list[Proposal] = [first]
         self.z, self.target, self.mixture = np.empty((0, 0)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
-        self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
+        self.log_weights, self.log, self.effective, self.settled = np.empty(0), -np.inf, 0.0, True
 
     @property
     def costs(self) -> Array:

@@ -22,7 +22,8 @@ from en4dvar.sampling.mixture import StudentMixture
 DRAWS = 400  # of a round
 HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
 LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
-TRIED = 4  # such rounds, at most, and
+TRIED, MOST_TRIED = 4, 20  # such rounds, at most, and as long as the evidence
+RISEN = 0.06  # rises by so much within two rounds: each reaches farther along a valley; otherwise that is 0.05 at most;
 GOOD = 0.25  # the effective share of one that ends them,
 HOPELESS = 0.25  # and that, times the share of the mixture, below which none that follows is good enough
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
@@ -45,6 +46,7 @@ class WeightedDraws:
 
     ``mode`` (D,) is the number of the minimum that each draw belongs to, see :func:`belonging`, ``costs`` (D,) its J,
     ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw, ``proposal`` a mixture that resembles them.
+    ``settled``: whether the last rounds that trained an emulator reached no farther than those before.
     """
 
     x: Array
@@ -54,6 +56,7 @@ class WeightedDraws:
     log_evidence: float
     best: Array
     proposal: StudentMixture
+    settled: bool = True
 
     @property
     def lowest(self) -> float:
@@ -148,6 +151,7 @@ def sample_modes(
         proposal=StudentMixture(
             mixture.share, prior.from_white(mixture.centre), np.ascontiguousarray(columns.transpose(0, 2, 1))
         ),
+        settled=sampler.settled,
     )
 
 
@@ -169,8 +173,8 @@ def _guided(
     mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
     """
     start: StudentMixture | EmulatedProposal = mixture
-    share, of_mixture = 0.0, mixed.effective / len(mixed.z)
-    for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
+    of_mixture, logs = mixed.effective / len(mixed.z), list[float]()
+    for heat in (*HEATS, *(LAST_HEAT,) * MOST_TRIED):
         proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat)
         if proposal is None:
             return mixed, mixture, True
@@ -178,12 +182,16 @@ def _guided(
         if not more(sampler):
             return sampler, proposal.mixture, False
         start, share = proposal, sampler.effective / DRAWS
-        if heat == LAST_HEAT and not HOPELESS * of_mixture <= share < GOOD:
+        logs.append(sampler.log)
+        rise = logs[-1] - min(logs[-3:])
+        enough = share >= GOOD or len(logs) >= len(HEATS) + TRIED
+        if heat == LAST_HEAT and (share < HOPELESS * of_mixture or (enough and rise < RISEN)):
             break
     final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT) if share >= of_mixture else None
     if final is None:
         return mixed, mixture, True
     sampler = FixedDraws(final, mixed.stream, DRAWS)
+    sampler.settled = rise < RISEN
     return sampler, final.mixture, more(sampler)
 
 

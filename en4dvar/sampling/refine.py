@@ -54,6 +54,7 @@ CLEARED = 0.85  # effective share of the members above which no run was found th
 LogDensity = Callable[[Array], Array]
 Points = tuple[Array, Array, LogDensity]
 """(B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
+STILL_REACHING = "every round of draws reached farther along the posterior than that before: its ends may be missing"
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
@@ -366,7 +367,8 @@ def refined(
         summary = _summary(draws, posterior)
         kept = draws.x[resampled(draws.shares, KEPT, member_stream(seed, "kept draws"))]
         own = _own_draws(draws.x, draws.shares, draws.mode, draws.costs, len(minima))
-        return Refined(members, summary, own, draws.log_evidence, draws.lowest, draws=kept)
+        told = () if draws.settled else (caution("chain-not-converged", STILL_REACHING),)
+        return Refined(members, summary, own, draws.log_evidence, draws.lowest, draws=kept, warnings=told)
     several = draws is not None and len(minima) > 1
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)

@@ -352,7 +352,7 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
         "the population of a, the population of b and 4 of 6 data sets, worst set0, set1, set2: misfit (residuals"
         in lines
     )
-    assert "the population of a, the population of b: chain-not-converged (the Markov chains disagree); " in lines
+    assert "the population of a, the population of b: chain-not-converged (the draws have not settled); " in lines
     one = _Warnings()
     one.add("set1", [])
     one.add("set2", [caution("lost-frame", "after the reading at 2 s")])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr, ndtri
 
 from en4dvar import estimate
 from en4dvar.data.noise import Predicted, noise_of
@@ -12,7 +13,7 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.sampling import emulated_draws
+from en4dvar.sampling import emulated_draws, modes
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns, log_ratio
 from en4dvar.sampling.modes import HEATS, LAST_HEAT, TOO_FEW, sample_modes
 
@@ -187,6 +188,40 @@ def test_a_mixture_that_has_not_closed_in_judges_nothing():
     expected = np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z)
     drawn = np.quantile(np.log(result.posterior["b"].values / median) / width, [0.05, 0.5, 0.95])
     assert drawn == pytest.approx(expected, abs=0.25)
+
+
+T = np.linspace(0.1, 1.0, 10)
+Y = -0.001 * np.array([3.33, 9.75, 9.67, 11.51, 15.31, 16.27, 20.85, 17.52, 22.85, 27.16])
+
+
+def product(seed=0):
+    """a b t with a normal and b half-normal, of which little is known but a b."""
+    prior = {"a": {"prior": "normal", "mean": 0.81, "std": 1.01}, "b": {"prior": "half-normal", "std": 1.49}}
+    return estimate(
+        lambda p, t: p["a"] * p["b"] * t, (T, Y), prior, error=0.00162, seed=seed, cheap=True, progress=False,
+        prior_correlation=[{"between": ["a", "b"], "correlation": 0.68}],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_draws_go_on_as_long_as_each_round_reaches_farther_along_a_valley():
+    """The 5 % point of a is −1.5, by a sum over a grid; it was −1.02, −1.13 and −0.82."""
+    z, other = np.linspace(-5, 5, 2001), np.linspace(-5, 5, 3001)[:, None]
+    a, b = 0.81 + 1.01 * z, 1.49 * ndtri(0.5 + 0.5 * ndtr(other))
+    misfit = (Y @ Y - 2 * a * b * (T @ Y) + (a * b) ** 2 * (T @ T)) / 0.00162**2
+    logs = -0.5 * (misfit + (z**2 - 1.36 * z * other + other**2) / (1 - 0.68**2))
+    density = np.sum(np.exp(logs - logs.max()), axis=0)
+    exact = np.interp(0.05, np.cumsum(density) / density.sum(), a)
+    ends = [np.quantile(product(seed).posterior["a"].values, 0.05) for seed in range(3)]
+    assert np.mean(ends) == pytest.approx(exact, abs=0.3)
+
+
+@pytest.mark.slow
+def test_rounds_that_end_before_are_told(monkeypatch):
+    assert "chain-not-converged" not in {c.code for c in product().cautions}
+    monkeypatch.setattr(modes, "MOST_TRIED", 1)
+    (told,) = (c for c in product().cautions if c.code == "chain-not-converged")
+    assert "emulator" not in told.advice
 
 
 def test_the_integral_of_a_density_beyond_the_draws_of_another_is_known():

@@ -330,7 +330,8 @@ def _lost(case: Case) -> str:
 
 
 def _chain(case: Case) -> str:
-    on = "set assimilation.emulator: on, which guides the chain, or " * (case.a.settings.emulator != "on")
+    guided = case.a.settings.emulator == "on" or "mcmc_steps" not in case.a.refinement
+    on = "set assimilation.emulator: on, which guides the chain, or " * (not guided)
     return f"do not quote these intervals; {on}run again with more data or narrower priors"
 
 
