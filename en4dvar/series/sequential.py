@@ -36,6 +36,7 @@ from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, Member
 
 R = TypeVar("R")
 REFLECTIONS = 4  # of a rotation
+BYSTANDERS = 16
 BLOCK = 64  # rotations drawn together; part of the random numbers' definition
 
 
@@ -103,6 +104,11 @@ class _Run:
         cycles = len(series.times)
         self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
         self.trail: list[Array] = []
+        self.bystanders = np.empty((len(members), 0))
+        if self.scheme.perturbs and settings.localisation is None:
+            drawn = member_stream(seed, "bystanders").standard_normal((len(members), BYSTANDERS))
+            drawn = fresh_noise(centre(members)[1], drawn)
+            self.bystanders = drawn / drawn.std(axis=0, ddof=1)
         self.covariances: tuple[Array, ...] = ()  # (n, p) and (p, p), averages over the forecasts so far
         self.ensemble, self.start = members, 0  # start: k is the k-th observation time
         self.failures: list[str] = []
@@ -114,6 +120,7 @@ class _Run:
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
+            self.bystanders = resume.bystanders
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.predicted = InnovationRecorder(series, truth is None, resume)
@@ -126,7 +133,7 @@ class _Run:
         return SequentialState(
             before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
             self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
-            self.start, tuple(self.trail), self.covariances,
+            self.start, tuple(self.trail), self.covariances, self.bystanders,
         )  # fmt: skip
 
     def result(self) -> SequentialState:
@@ -153,6 +160,11 @@ class _Run:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
             anomalies = rotate(anomalies, turned)
         inflated = self.settings.inflation.apply(members, anomalies)
+        if self.bystanders.size:
+            still, stood = centre(self.bystanders)
+            by = descent.weights.T @ stood
+            by = by if self.rotations is None else rotate(by, turned)
+            self.bystanders = still + descent.weights.w @ stood + self.settings.inflation.apply(self.bystanders, by)
         if window.localisation is not None:
             kept = window.localisation.without_place
             inflated[:, kept] = anomalies[:, kept]
@@ -348,6 +360,7 @@ class _Run:
             )
         alive = np.flatnonzero([not reason for reason in failed])
         self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
+        self.bystanders = self.bystanders[alive]
         return alive if isinstance(rows, slice) else rows[alive]
 
 
