@@ -98,10 +98,14 @@ class SeriesResult:
         told = [*members_lost(self.run, problem.members)]
         told += too_few(problem.start, problem.settings, problem.members, times)
         told += narrowed(self.run, problem.start, problem.settings, times)
-        squares = self.normalised[np.isfinite(self.normalised)] ** 2
-        size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
-        low, high = np.sqrt(np.array(chi2_interval(float(len(squares)))) / max(1, len(squares)))
-        if size > max(TOO_SURE, high):
+        size, (low, high) = scatter(self.normalised)
+        missed, (_, most) = scatter(self.run.residuals)
+        if missed > max(TOO_SURE, most):
+            told.append(
+                f"residuals of the analyses are {missed:.2g} times the errors: windows have ended in a wrong minimum "
+                "of J (give a shorter lag), or model or errors are wrong (give model_error or larger errors)"
+            )
+        elif size > max(TOO_SURE, high):
             told.append(
                 f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
                 "itself; give model_error, inflation or larger errors"
@@ -109,6 +113,14 @@ class SeriesResult:
         if size < min(TOO_WIDE, low):
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
+
+
+def scatter(normalised: Array) -> tuple[float, Array]:
+    """Root mean square of what should have a variance of 1, NaN in gaps, and the interval (2,) of chance."""
+    squares = normalised[np.isfinite(normalised)] ** 2
+    count = max(1, len(squares))
+    interval = np.sqrt(np.array(chi2_interval(float(len(squares)))) / count)
+    return float(np.sqrt(squares.mean())) if len(squares) else 1.0, interval
 
 
 def members_lost(run: SequentialState, members: int) -> Iterator[str]:

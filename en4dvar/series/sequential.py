@@ -103,6 +103,7 @@ class _Run:
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         cycles = len(series.times)
         self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.residuals = np.full(series.values.shape, np.nan)
         self.trail: list[Array] = []
         self.bystanders = np.empty((len(members), 0))
         if self.scheme.perturbs and settings.localisation is None:
@@ -120,7 +121,7 @@ class _Run:
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
-            self.bystanders = resume.bystanders
+            self.bystanders, self.residuals[: resume.cycle] = resume.bystanders, resume.residuals
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.predicted = InnovationRecorder(series, truth is None, resume)
@@ -134,6 +135,7 @@ class _Run:
             before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
             self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
             self.start, tuple(self.trail), self.covariances, self.bystanders,
+            self.residuals[:done].copy(),
         )  # fmt: skip
 
     def result(self) -> SequentialState:
@@ -227,6 +229,7 @@ class _Run:
     def advance(self, complete: Array, first: int, newest: int, repeated: bool) -> None:
         """Record what the ``complete`` members at the start say of later times, and move the ensemble on."""
         lag, last = self.scheme.lag, len(self.series.times)
+        std = np.broadcast_to(self.series.std, self.series.values.shape)
         next_start = min(newest, max(self.start, newest + self.scheme.shift - lag)) if lag else newest
         smoothed = range(max(self.start, 1), next_start)
         if lag and newest == last and self.settings.to_end:
@@ -243,6 +246,9 @@ class _Run:
         at = dict(zip(indices, states, strict=True))
         for index in range(first, newest + 1):
             self.after.put(index - 1, self.physical(at[index]))
+            if lag:
+                predicted = self.flow.predict(at[index], index).mean(axis=0)
+                self.residuals[index - 1] = (self.series.values[index - 1] - predicted) / std[index - 1]
         for index in smoothed:
             if index > self.start:
                 self.smooth.put(index - 1, self.physical(at[index]))

@@ -1,5 +1,5 @@
 """What the result of a series says of members that were lost, of too few for a model error, of innovations that are not
-what they should be, and of constants that chance makes too sure.
+what they should be, of constants that chance makes too sure, and of windows that end in a wrong minimum.
 """
 
 import re
@@ -12,6 +12,7 @@ from toys import SLOPE, Swing
 
 import en4dvar
 from en4dvar import Field, ForwardModel, Observable, Parameter, StateField, StateLayout
+from en4dvar_lorenz import Lorenz63
 
 TIMES = np.arange(1.0, 9.0) / 2
 READ = np.array([(expm(SLOPE * t) @ [1.1, 0.2])[0] for t in TIMES])
@@ -162,3 +163,26 @@ def test_perturbed_observations_that_move_and_narrow_a_constant_are_told():
 @pytest.mark.parametrize("keys", [{"scheme": "etkf"}, {"scheme": "enkf", "varies": {"std": 1, "every": 1}}])
 def test_what_is_not_perturbed_or_not_constant_is_not_told_so(keys):
     assert "perturbed" not in "".join(stood_by(**keys).warnings)
+
+
+def test_windows_that_end_in_a_wrong_minimum_are_told():
+    """Forecasts of Lorenz-63 over all of twelve time units are so wide that no innovation is too large."""
+    times, rng = 0.25 * np.arange(1, 49), np.random.default_rng(0)
+    start = np.array([[1.6, -1.4, 25.1, 10, 28, 8 / 3]])
+    (path,) = Lorenz63.from_settings(Lorenz63.Settings()).trajectories(start, times)
+    read = path.states[:, :3] + rng.standard_normal((48, 3))
+
+    def along(lag):
+        return en4dvar.estimate_sequence(
+            "lorenz63", {name: (times, read[:, j]) for j, name in enumerate("xyz")}, {}, error=dict.fromkeys("xyz", 1),
+            initial_std=dict.fromkeys("xyz", 1),
+            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag},
+        )  # fmt: skip
+
+    whole = along(48)
+    assert np.sqrt(np.nanmean(whole.normalised**2)) < 1.2
+    size = np.sqrt(np.mean((read - whole.run.analysis.mean[:, :3]) ** 2))
+    assert size > 5
+    (told,) = whole.warnings
+    assert told.startswith(f"residuals of the analyses are {size:.2g} times the errors: windows have ended in a wrong")
+    assert along(2).warnings == ()
