@@ -125,11 +125,13 @@ class DualSystem:
 
 @dataclass
 class FieldDescent(Descends):
-    """Where a descent stands: the ``centre`` x̄0 + Σ_k L_k λ_k (n,) and its ``prediction`` (K,), ``costs`` J of each
-    iterate, the ``tangents`` Y_k (N, K) and ``duals`` λ_k (K,) so far; its ``step`` is a :class:`DualSystem`."""
+    """Where a descent stands: the ``centre`` x̄0 + Σ_k L_k λ_k (n,), its ``background`` J_b and ``prediction`` (K,),
+    ``costs`` J of each iterate, the ``tangents`` Y_k (N, K) and ``duals`` λ_k (K,) so far; its ``step`` is a
+    :class:`DualSystem`."""
 
     centre: Array
     prediction: Array
+    background: float = 0.0
     costs: list[float] = field(default_factory=list)
     tangents: tuple[Tangent, ...] = ()
     duals: tuple[Array, ...] = ()
@@ -186,7 +188,7 @@ class FieldObjective(Objective[FieldDescent]):
     def start(self) -> FieldDescent:
         first = self.data.predict(lambda _: self.mean[None], 1)[0]
         descent = FieldDescent(self.mean.copy(), first, forward_runs=1)
-        descent.costs.append(self.cost(descent.prediction, (), ()))
+        descent.costs.append(self.cost(first, 0.0))
         return descent
 
     def linearise(self, going: Sequence[FieldDescent]) -> list[DualSystem]:
@@ -243,11 +245,13 @@ class FieldObjective(Objective[FieldDescent]):
             prediction = yield x[None]
             if prediction is None:  # the model does not run there: nearer
                 continue
+            across = dual @ ((1 - a) * system.moved + 0.5 * system.covariance @ dual)
+            background = (1 - a) ** 2 * at.background + float(across)
             ahead = replace(
-                at, centre=x, prediction=prediction, tangents=(*at.tangents, system.tangent),
+                at, centre=x, prediction=prediction, background=background, tangents=(*at.tangents, system.tangent),
                 duals=(*((1 - a) * old for old in at.duals), dual),
             )  # fmt: skip
-            cost = self.cost(prediction, ahead.tangents, ahead.duals)
+            cost = self.cost(prediction, background)
             if cost < at.costs[-1]:
                 return Move(ahead, cost, a)
         return None
@@ -266,21 +270,16 @@ class FieldObjective(Objective[FieldDescent]):
                 at.stop = at.stop or "no decrease of J along the step"
             else:
                 ahead: FieldDescent = move.w
-                at.centre, at.prediction = ahead.centre, ahead.prediction
+                at.centre, at.prediction, at.background = ahead.centre, ahead.prediction, ahead.background
                 at.tangents, at.duals = ahead.tangents, ahead.duals
                 at.costs.append(move.cost)
             self.tell(replace(here, share=move.step_length if move else 0.0))
             at.ended = bool(at.stop)
 
-    def cost(self, prediction: Array, tangents: Sequence[Tangent], duals: Sequence[Array]) -> float:
-        """J of the iterate x̄0 + Σ_k L_k λ_k."""
+    def cost(self, prediction: Array, background: float) -> float:
+        """J of an iterate with its J_b."""
         misfit = (self.data.values - prediction) / self.data.std
-        return self.background(tangents, duals) + 0.5 * float(misfit @ misfit)
-
-    def background(self, tangents: Sequence[Tangent], duals: Sequence[Array]) -> float:
-        """J_b of the iterate x̄0 + Σ_k L_k λ_k."""
-        pairs = list(zip(tangents, duals, strict=True))
-        return 0.5 * sum(float(a @ self.gain.between(Y, Z) @ b) for Y, a in pairs for Z, b in pairs)
+        return background + 0.5 * float(misfit @ misfit)
 
     def _pass(self, at: FieldDescent) -> Pass:
         """The iterate as it is told, with the posterior ensemble of its tangent."""
@@ -290,8 +289,7 @@ class FieldObjective(Objective[FieldDescent]):
             anomalies = self.anomalies[:, part]
             return np.asarray(centre[part] + anomalies + update(part, anomalies))
 
-        background = self.background(at.tangents, at.duals)
-        return Pass(centre, at.prediction, members, background, at.step.length, dfs=float(at.step.leverages.sum()))
+        return Pass(centre, at.prediction, members, at.background, at.step.length, dfs=float(at.step.leverages.sum()))
 
     def update(self, tangent: Tangent) -> Update:
         """What turns prior anomalies into posterior ones."""

@@ -1,6 +1,6 @@
 """Ensemble moments along a sequential run, taken of many cycles at once, and the outcome that holds them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -160,7 +160,9 @@ class SequentialState:
     ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
     leave, NaN: all. ``members`` (N', n + changes of what varies) at the ``start`` of the window (0: time zero, k:
     observation time k); ``kept``: index of a time → analysis members (N', n), physical; ``failures`` the reasons of the
-    members lost.
+    members lost. ``bystanders`` (N', m): constants that nothing depends on, N(0, 1) at the start, as the analyses of a
+    scheme that perturbs have left them; (N', 0) of another. ``residuals`` (K, p): observations less the predictions of
+    the analysis, over their errors; NaN of a filter.
 
     The rest of a run depends on its arguments and these alone: ``cycle`` observation times are done; ``trail`` is what
     a smoother keeps, ``covariances`` are averages, (n, p) and (p, p), both empty of a run that has ended. Random
@@ -183,6 +185,8 @@ class SequentialState:
     start: int = 0
     trail: tuple[Array, ...] = ()
     covariances: tuple[Array, ...] = ()
+    bystanders: Array = field(default_factory=lambda: np.empty((0, 0)))
+    residuals: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def ensemble(self) -> Array:

@@ -1,5 +1,6 @@
 """A series to assimilate: what is known at time zero, what was observed, and how it is assimilated."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +19,7 @@ from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
 
 TOO_SURE, TOO_WIDE = 1.2, 1 / 1.5  # root mean square of normalised innovations that is told, beyond chance
+CHANCE = 3.0  # error over spread of a constant that nothing depends on, that is told
 
 
 @dataclass(frozen=True)
@@ -95,10 +97,15 @@ class SeriesResult:
         problem, times = self.problem, len(self.problem.series.times)
         told = [*members_lost(self.run, problem.members)]
         told += too_few(problem.start, problem.settings, problem.members, times)
-        squares = self.normalised[np.isfinite(self.normalised)] ** 2
-        size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
-        low, high = np.sqrt(np.array(chi2_interval(float(len(squares)))) / max(1, len(squares)))
-        if size > max(TOO_SURE, high):
+        told += narrowed(self.run, problem.start, problem.settings, times)
+        size, (low, high) = scatter(self.normalised)
+        missed, (_, most) = scatter(self.run.residuals)
+        if missed > max(TOO_SURE, most):
+            told.append(
+                f"residuals of the analyses are {missed:.2g} times the errors: windows have ended in a wrong minimum "
+                "of J (give a shorter lag), or model or errors are wrong (give model_error or larger errors)"
+            )
+        elif size > max(TOO_SURE, high):
             told.append(
                 f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
                 "itself; give model_error, inflation or larger errors"
@@ -106,6 +113,14 @@ class SeriesResult:
         if size < min(TOO_WIDE, low):
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
+
+
+def scatter(normalised: Array) -> tuple[float, Array]:
+    """Root mean square of what should have a variance of 1, NaN in gaps, and the interval (2,) of chance."""
+    squares = normalised[np.isfinite(normalised)] ** 2
+    count = max(1, len(squares))
+    interval = np.sqrt(np.array(chi2_interval(float(len(squares)))) / count)
+    return float(np.sqrt(squares.mean())) if len(squares) else 1.0, interval
 
 
 def members_lost(run: SequentialState, members: int) -> Iterator[str]:
@@ -136,6 +151,26 @@ def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, 
             f"{members} members are fewer than the {needed} that a window of {lag} times with model error "
             f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
             "give more members, or a shorter lag"
+        )
+
+
+def narrowed(run: SequentialState, start: InitialEnsemble, settings: SequentialSettings, times: int) -> Iterator[str]:
+    """Where perturbed observations make constants too sure: that bystanders are moved and narrowed is chance alone.
+
+    A share d of the variance P a cycle, e² ← e² + d P and P ← (1 − d) λ² P: inflation λ = exp(¾ d) keeps e² below 2 P.
+    """
+    error, layout, by = settings.model_error, start.model.layout, run.bystanders
+    names = [name for name in (start.prior.names if start.prior else ()) if name in layout.names]
+    constant = [name for name in names if error is None or not np.any(error.rate[layout[name]])]
+    if not (constant and by.size):
+        return
+    variances = by.var(axis=0, ddof=1)
+    if (excess := math.sqrt(np.mean((1 + by.mean(axis=0) ** 2) / variances))) > CHANCE:
+        taken = 2 * math.log(settings.inflation.multiplicative) - math.log(variances.mean()) / times
+        yield (
+            f"perturbed observations move and narrow {', '.join(constant)} by chance, cycle by cycle: what no reading "
+            f"tells of would be off by {excess:.2g} times its spread; give inflation: "
+            f"{math.ceil(1000 * math.exp(0.75 * taken)) / 1000:g}, or more members"
         )
 
 

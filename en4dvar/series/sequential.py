@@ -36,6 +36,7 @@ from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, Member
 
 R = TypeVar("R")
 REFLECTIONS = 4  # of a rotation
+BYSTANDERS = 16
 BLOCK = 64  # rotations drawn together; part of the random numbers' definition
 
 
@@ -102,7 +103,13 @@ class _Run:
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         cycles = len(series.times)
         self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.residuals = np.full(series.values.shape, np.nan)
         self.trail: list[Array] = []
+        self.bystanders = np.empty((len(members), 0))
+        if self.scheme.perturbs and settings.localisation is None:
+            drawn = member_stream(seed, "bystanders").standard_normal((len(members), BYSTANDERS))
+            drawn = fresh_noise(centre(members)[1], drawn)
+            self.bystanders = drawn / drawn.std(axis=0, ddof=1)
         self.covariances: tuple[Array, ...] = ()  # (n, p) and (p, p), averages over the forecasts so far
         self.ensemble, self.start = members, 0  # start: k is the k-th observation time
         self.failures: list[str] = []
@@ -114,6 +121,7 @@ class _Run:
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
+            self.bystanders, self.residuals[: resume.cycle] = resume.bystanders, resume.residuals
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.predicted = InnovationRecorder(series, truth is None, resume)
@@ -126,7 +134,8 @@ class _Run:
         return SequentialState(
             before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
             self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
-            self.start, tuple(self.trail), self.covariances,
+            self.start, tuple(self.trail), self.covariances, self.bystanders,
+            self.residuals[:done].copy(),
         )  # fmt: skip
 
     def result(self) -> SequentialState:
@@ -153,6 +162,11 @@ class _Run:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
             anomalies = rotate(anomalies, turned)
         inflated = self.settings.inflation.apply(members, anomalies)
+        if self.bystanders.size:
+            still, stood = centre(self.bystanders)
+            by = descent.weights.T @ stood
+            by = by if self.rotations is None else rotate(by, turned)
+            self.bystanders = still + descent.weights.w @ stood + self.settings.inflation.apply(self.bystanders, by)
         if window.localisation is not None:
             kept = window.localisation.without_place
             inflated[:, kept] = anomalies[:, kept]
@@ -215,6 +229,7 @@ class _Run:
     def advance(self, complete: Array, first: int, newest: int, repeated: bool) -> None:
         """Record what the ``complete`` members at the start say of later times, and move the ensemble on."""
         lag, last = self.scheme.lag, len(self.series.times)
+        std = np.broadcast_to(self.series.std, self.series.values.shape)
         next_start = min(newest, max(self.start, newest + self.scheme.shift - lag)) if lag else newest
         smoothed = range(max(self.start, 1), next_start)
         if lag and newest == last and self.settings.to_end:
@@ -231,6 +246,9 @@ class _Run:
         at = dict(zip(indices, states, strict=True))
         for index in range(first, newest + 1):
             self.after.put(index - 1, self.physical(at[index]))
+            if lag:
+                predicted = self.flow.predict(at[index], index).mean(axis=0)
+                self.residuals[index - 1] = (self.series.values[index - 1] - predicted) / std[index - 1]
         for index in smoothed:
             if index > self.start:
                 self.smooth.put(index - 1, self.physical(at[index]))
@@ -348,6 +366,7 @@ class _Run:
             )
         alive = np.flatnonzero([not reason for reason in failed])
         self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
+        self.bystanders = self.bystanders[alive]
         return alive if isinstance(rows, slice) else rows[alive]
 
 

@@ -21,7 +21,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.series.moments import Moments, SequentialState
-from en4dvar.series.problem import members_lost, too_few
+from en4dvar.series.problem import members_lost, narrowed, too_few
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import SequentialSettings
@@ -108,6 +108,7 @@ class TwinResult:
         experiment = self.experiment
         warnings = [*members_lost(self.run, experiment.members)]
         warnings += too_few(experiment.start, experiment.sequential, experiment.members, experiment.cycles)
+        warnings += narrowed(self.run, experiment.start, experiment.sequential, experiment.cycles)
         fields, prior = self.experiment.model.layout, self.experiment.prior
         names = np.array([f.name for f in fields for _ in range(f.size)])
         hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]

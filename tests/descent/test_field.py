@@ -103,6 +103,28 @@ def test_en4dvar_of_a_nonlinear_field_minimises_the_cost():
     assert np.max(np.abs(end.centre - mean - root @ best.x)) < 1e-4
 
 
+def test_the_background_of_many_iterates_is_the_sum_over_their_pairs(monkeypatch):
+    """J_b = ½ Σ λ_iᵀ H_i B H_kᵀ λ_k, also where steps are shortened; each iterate meets those before it once."""
+    rng, read, made, between = np.random.default_rng(1), np.arange(2, 30, 4), [], ByDistance.between
+    monkeypatch.setattr(ByDistance, "between", lambda *them: made.append(1) or between(*them))
+
+    def forward(x):
+        return np.cumsum(np.exp(-x), axis=1)[:, read]
+
+    ensemble = np.cumsum(rng.standard_normal((8, 30)), axis=1) / 3
+    data = FieldData(forward(rng.standard_normal((1, 30)))[0], np.full(7, 0.3), forward)
+    gain = line(30, read, 4.0)
+    end = field_en4dvar(ensemble, data, gain, tolerance=1e-6, cost_tolerance=1e-9)
+    iterates = len(end.costs)
+    assert iterates > 6
+    assert len(made) < iterates**2
+    pairs = [*zip(end.tangents, end.duals, strict=True)]
+    background = 0.5 * sum(a @ gain.between(Y, Z) @ b for Y, a in pairs for Z, b in pairs)
+    assert end.background == pytest.approx(background, rel=1e-9)
+    misfit = (data.values - end.prediction) / data.std
+    assert end.costs[-1] == pytest.approx(background + 0.5 * misfit @ misfit, rel=1e-9)
+
+
 def many(seed: int):
     """2000 parameters of variance 1, correlated over 5 neighbours, 100 members, 200 readings; the exact posterior."""
     rng = np.random.default_rng(seed)

@@ -10,12 +10,14 @@ from kuramoto import NU as TRUE_NU
 from kuramoto import READ as CELLS_READ
 from scipy.optimize import least_squares
 
+import en4dvar
 from en4dvar.config.varies import modes_of
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Places, Series
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.state import Field
+from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, StateLayout
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import correlation_of_places
 from en4dvar.priors.field_prior import FieldPrior
@@ -174,3 +176,45 @@ def test_nine_of_ten_rings_end_at_the_minimum_of_the_truth(tmp_path):
         found = np.append(result.posterior["nu"].values.mean(), result.dataset("fields")["u_centre"].values)
         reached += np.max(np.abs(found - mean) / std) < 0.1
     assert reached >= 9
+
+
+class Canal(ForwardModel):
+    """Heads along a soil that carries rain to both ends, by its ln T: each tells of all cells."""
+
+    parameters = ()
+    layout = StateLayout(tuple(Field(name, 60, coordinates=np.arange(60.0)) for name in ("ln_T", "head")))
+    observables = (Observable("head", "1", StateField("head")),)
+    time_unit = "1"
+
+    def initial_state(self, theta):
+        return np.zeros(120)
+
+    def trajectories(self, x, times):
+        resistance = np.exp(-x[:, :60])
+        heads, lost = (np.cumsum(rain * resistance, axis=1) for rain in (1, 0.02 * (np.arange(60) + 0.5)))
+        states = np.hstack([x[:, :60], lost[:, -1:] / heads[:, -1:] * heads - lost])
+        return Batch(np.broadcast_to(times, (len(x), 1)), states[:, None], self.layout)
+
+
+def test_readings_that_are_not_local_are_advised_less_localisation():
+    """Localised it stops far from the readings, after fewer iterations than are allowed; without, nothing is wrong."""
+    model, cells, rng = Canal(), np.arange(4, 60, 8), np.random.default_rng(0)
+    covariance = correlation_of_places("gaussian", np.arange(60.0)[:, None], 8.0) + 1e-9 * np.eye(60)
+    truth = np.linalg.cholesky(covariance) @ rng.standard_normal(60)
+    heads = model.trajectories(np.append(truth, np.zeros(60))[None], np.ones(1)).states[0, 0, 60:]
+    std = 0.01 * heads.max()
+    read = np.ones(len(cells)), heads[cells] + std * rng.standard_normal(len(cells))
+
+    def estimated(**keys):
+        return en4dvar.estimate(
+            model, {"head": read}, {}, error={"head": std}, series={"head": {"places": cells}},
+            initial_state={"ln_T": {"std": 1, "kernel": "gaussian", "length": 8}},
+            assimilation={"members": 40, **keys},
+        )  # fmt: skip
+
+    advice = {c.code: c.advice for c in estimated(localisation={"radius": 8}).cautions}
+    assert advice["misfit"].startswith("settle the warning not-converged first")
+    assert "larger assimilation.localisation.radius (it is 8), or leave localisation out" in advice["not-converged"]
+    whole = estimated()
+    assert not {"misfit", "not-converged"} & {c.code for c in whole.cautions}
+    assert np.sqrt(np.mean((whole.dataset("fields")["ln_T_mean"].values - truth) ** 2)) < 0.3

@@ -1,6 +1,8 @@
-"""What the result of a series says of members that were lost, of too few for a model error, and of innovations that are
-not what they should be.
+"""What the result of a series says of members that were lost, of too few for a model error, of innovations that are not
+what they should be, of constants that chance makes too sure, and of windows that end in a wrong minimum.
 """
+
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from scipy.linalg import expm
 from toys import SLOPE, Swing
 
 import en4dvar
-from en4dvar import Field, ForwardModel, Observable, StateField, StateLayout
+from en4dvar import Field, ForwardModel, Observable, Parameter, StateField, StateLayout
+from en4dvar_lorenz import Lorenz63
 
 TIMES = np.arange(1.0, 9.0) / 2
 READ = np.array([(expm(SLOPE * t) @ [1.1, 0.2])[0] for t in TIMES])
@@ -115,3 +118,71 @@ def test_innovations_a_third_too_large_are_told_where_they_are_many(stated):
     told = followed(Swing, "etkf", 8, read=(when, read), error=0.1 * stated).warnings
     assert [words for words in told if "too sure of" in words] == list(told)
     assert len(told) == (stated < 1)
+
+
+class Bystander(ForwardModel):
+    """A variable that is read, doubles and changes its sign at random, and a constant that nothing depends on."""
+
+    parameters = (Parameter("c", "1"),)
+    layout = StateLayout((Field("a"), Field("c")))
+    observables = (Observable("a", "1", StateField("a")),)
+    time_unit = "1"
+
+    def initial_state(self, theta):
+        return np.array([0.0, theta["c"]])
+
+    def step(self, x, t0, t1):
+        return np.array([3.7 * np.sin(x[0]), x[1]])
+
+
+def stood_by(scheme, seed=0, varies=None, **keys):
+    rng = np.random.default_rng(seed)
+    read = [rng.standard_normal()]
+    for _ in range(79):
+        read.append(3.7 * np.sin(read[-1]))
+    return en4dvar.estimate_sequence(
+        Bystander, {"a": (np.arange(80.0), np.array(read) + rng.standard_normal(80))},
+        {"c": {"prior": "normal", "mean": 0, "std": 1, **({"varies": varies} if varies else {})}},
+        error={"a": 1}, initial_std={"a": 1},
+        assimilation={"scheme": scheme, "members": 20, **keys}, seed=seed,
+    )  # fmt: skip
+
+
+def test_perturbed_observations_that_move_and_narrow_a_constant_are_told():
+    """Its posterior is its prior, N(0, 1): the error of a mean m is that of a truth drawn from it, √(1 + m²)."""
+    runs = [stood_by("enkf", seed) for seed in range(6)]
+    mean, std = (np.array([vars(r.run.analysis)[name][-1, 1] for r in runs]) for name in ("mean", "std"))
+    told = runs[0].warnings[0]
+    excess, enough = map(float, re.findall(r"off by (\S+) times its spread; give inflation: (\S+),", told)[0])
+    assert told.startswith("perturbed observations move and narrow c by chance")
+    assert 0.5 < excess / np.sqrt(np.mean((1 + mean**2) / std**2)) < 2
+    assert excess > 5
+    assert stood_by("enkf", inflation=enough).warnings == ()
+
+
+@pytest.mark.parametrize("keys", [{"scheme": "etkf"}, {"scheme": "enkf", "varies": {"std": 1, "every": 1}}])
+def test_what_is_not_perturbed_or_not_constant_is_not_told_so(keys):
+    assert "perturbed" not in "".join(stood_by(**keys).warnings)
+
+
+def test_windows_that_end_in_a_wrong_minimum_are_told():
+    """Forecasts of Lorenz-63 over all of twelve time units are so wide that no innovation is too large."""
+    times, rng = 0.25 * np.arange(1, 49), np.random.default_rng(0)
+    start = np.array([[1.6, -1.4, 25.1, 10, 28, 8 / 3]])
+    (path,) = Lorenz63.from_settings(Lorenz63.Settings()).trajectories(start, times)
+    read = path.states[:, :3] + rng.standard_normal((48, 3))
+
+    def along(lag):
+        return en4dvar.estimate_sequence(
+            "lorenz63", {name: (times, read[:, j]) for j, name in enumerate("xyz")}, {}, error=dict.fromkeys("xyz", 1),
+            initial_std=dict.fromkeys("xyz", 1),
+            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag},
+        )  # fmt: skip
+
+    whole = along(48)
+    assert np.sqrt(np.nanmean(whole.normalised**2)) < 1.2
+    size = np.sqrt(np.mean((read - whole.run.analysis.mean[:, :3]) ** 2))
+    assert size > 5
+    (told,) = whole.warnings
+    assert told.startswith(f"residuals of the analyses are {size:.2g} times the errors: windows have ended in a wrong")
+    assert along(2).warnings == ()

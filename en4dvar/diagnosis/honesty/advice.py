@@ -91,6 +91,15 @@ class Case:
         return "" if settled else ", or declare the model cheap, if ten thousand runs take seconds"
 
     @property
+    def untapered(self) -> str:
+        """To taper less, where the gain is localised by distance: what acts from farther away cannot be fitted."""
+        local = self.a.settings.localisation
+        if local is None or local.radius is None:
+            return ""
+        larger = f"a larger assimilation.localisation.radius (it is {local.radius:g})"
+        return f"compare with {larger}, or leave localisation out"
+
+    @property
     def structure(self) -> str:
         """The catalogue's advice about residuals with structure."""
         option = "data.error.discrepancy: estimated"
@@ -158,8 +167,11 @@ def _not_converged(case: Case) -> str:
         return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J{chain}"
     little = "no action is needed if this step is small enough for you; else " * (case.caution.severity == "note")
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
-    if now < ENOUGH or not sampled:
-        return f"{little}set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
+    more = f"{little}set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
+    if case.untapered:
+        return f"{more}, or {case.untapered}" if "limit" in case.a.stop_reason else f"{little}{case.untapered}"
+    if now < ENOUGH:
+        return more
     unsure = "narrow the priors of the parameters that the data hardly constrain"
     return f"{little}set assimilation.refine: mcmc, which needs no minimum, or {unsure}"
 
@@ -186,8 +198,9 @@ def _misfit(case: Case) -> str:
         return _structure(case)
     if "odd-residuals" in case.codes and case.may_be_robust:
         return "see the advice about single readings; look at the residuals before a larger error is stated"
+    farther = f"{case.untapered}, if readings tell of more than what is near them; else " * bool(case.untapered)
     return (
-        f"look at the residuals; if the readings scatter as much as they do, {case.rescaled}, or "
+        f"{farther}look at the residuals; if the readings scatter as much as they do, {case.rescaled}, or "
         f"{case.with_scheme(SIGMA)}; if not, the model or the window must change"
     )
 
