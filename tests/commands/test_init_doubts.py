@@ -35,6 +35,13 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert f"{told}Units 1000 times larger would make it a usual one" in done.stderr
 
 
+def test_a_driven_bubble_whose_times_are_in_another_unit_is_noticed() -> None:
+    simulate("acoustic", "5 us:28 us:1 us", "1.4 um", Path("pulse.csv"))
+    told = [call("init", "--data", "pulse.csv", "--time-unit", unit, "--radius-unit", "um", "--start", "acoustic",
+                 "--out", f"{unit}.yaml").stderr for unit in ("us", "ns", "ms")]  # fmt: skip
+    assert ["are the units of both columns right?" in it for it in told] == [False, True, True]
+
+
 def _in_other_units(path: Path) -> str:
     """The same bubble in ms and mm, under the same names."""
     head, *rows = path.read_text().splitlines()
