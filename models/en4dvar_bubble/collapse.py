@@ -52,6 +52,7 @@ TAILS = 0.5  # of the range of the members' ln r: 48 of a Gaussian reach 2.2 sta
 SURE = 0.99  # one-sided probability, by the scatter of the samples
 REBOUND = 0.5  # of the collapse time: a rebound that has no top by then is not seen, or there is none
 SLIGHT = 0.03  # of the range of the radii: by so much the top of a slight rebound stands out
+FAR = 30.0  # a ratio beyond this factor is that of a wrong unit, whatever drives or damps a bubble
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
 
 
@@ -189,16 +190,16 @@ def doubt(view: Lobe, medium: Medium, expected: Expected = NOTHING) -> str:
     beyond its margin, unless half of the members are there as well, or a common gel comes as far.
     """
     ratio, (least, largest) = view.rayleigh_ratio(medium), bounds(view.R_max, medium)
-    sure, ratios = 1 + view.margin, expected.ratios
+    sure, ratios, largest = 1 + view.margin, expected.ratios, min(largest, FAR)
     apart = max(APART, sure)
     short, long = ratio * sure < least, ratio > largest * sure
     half = 2 * np.sum(ratios < least if short else ratios > largest) > len(ratios)
     if (short or long) and not half and not expected.like(ratio * apart if short else ratio / apart, short):
-        limit = f"{COMMON.G / 1e3:g} kPa allows no less than {least:.2f}"
+        limit = f"; a gel of {COMMON.G / 1e3:g} kPa allows no less than {least:.2f}"
         if long:
-            limit = f"{COMMON.mu:g} Pa s allows no more than {largest:.2f}"
+            limit = f"; a gel of {COMMON.mu:g} Pa s allows no more than {largest:.2f}" if largest < FAR else ""
         more = f", or the gel is {'thicker' if long else 'stiffer'}" if conceivable(view, medium) else ""
-        return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}{more}"
+        return f"{_measured(ratio)}{limit}: {_explained(SOFT / ratio)}{more}"
     if len(ratios) and not expected.reaches(ratio, apart):
         usual = float(np.median(ratios))
         span = f"{min(ratios):.2f} to {max(ratios):.2f}"
@@ -214,7 +215,7 @@ def conceivable(view: Lobe, medium: Medium) -> bool:
 
 
 def _measured(ratio: float) -> str:
-    return f"the collapse takes {ratio:.2g} of the Rayleigh time 0.915 R_max √(ρ/p∞)"
+    return f"the collapse takes {float(f'{ratio:.2g}'):g} of the Rayleigh time 0.915 R_max √(ρ/p∞)"
 
 
 def _twice(factor: float) -> bool:
@@ -225,10 +226,10 @@ def _explained(factor: float) -> str:
     """What would make the history that of a usual bubble; ``factor`` is what its collapse time falls short by."""
     if _twice(factor):
         return "diameters given as radii? Or a time step, a pixel or a unit is wrong by a factor of 2"
-    by = factor if factor > 1 else 1 / factor
+    by = float(f"{max(factor, 1 / factor):.3g}")
     size, step = ("large", "short") if factor > 1 else ("small", "long")
-    words = f"radii {by:.3g} times too {size}, or the time step {by:.3g} times too {step}"
-    return f"{words}; are the units of both columns right?" if by > 30 else f"{words} (pixel size, frame rate, units)"
+    asked = "are the units of both columns right?" if by > FAR else "pixel size, frame rate, units"
+    return f"radii {by:g} times too {size}, or the time step {by:g} times too {step} ({asked})"
 
 
 def single(times: Array, radius: Array) -> bool:
@@ -260,6 +261,8 @@ def doubts(
         return ()
     ratios, common = [], []
     for path, usual in zip(predicted, _common(members, len(predicted)), strict=True):
+        if path[int(np.argmax(path)) :].min() > (1 - SLIGHT) * path.max():
+            continue  # of a bubble that rests, or grows to the end, any time may be told
         try:
             ratios.append(lobe(times, path).rayleigh_ratio(medium))
         except DataError:

@@ -36,7 +36,7 @@ from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.laws import REGISTRY, get_law
 from en4dvar_bubble.laws.parameters import ALPHA
 from en4dvar_bubble.laws.tabulate import GRID, ends
-from en4dvar_bubble.medium import saturated_vapour_pressure
+from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
 from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings
@@ -258,7 +258,6 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         return Alternative(name, words, replace(cast(Any, model), **options), options=_as_options(keys))
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
-    saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
     if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
@@ -277,17 +276,32 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     else:
         words = "the gas were polytropic (gas: polytropic)"
-        of_vapour = ("none", SATURATED, saturated) if model.vapour == "transport" else (model.vapour, NOTHING, medium)
-        vapour, said, its = of_vapour
+        of_vapour = model.vapour, NOTHING, medium
+        vapour, said, its = ("none", SATURATED, _saturated(medium)) if model.vapour == "transport" else of_vapour
         yield changed("gas_model", words, said, gas="polytropic", medium_heat="cold", vapour=vapour, medium=its)
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
+    yield from _of_vapour(model, changed)
+    yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
+    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
+    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")
+
+
+def _saturated(medium: Medium) -> Medium:
+    return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
+
+
+def _of_vapour(model: Dynamics, changed: Callable[..., Alternative]) -> Iterator[Alternative]:
+    """What is ``changed`` of the vapour: how fast it diffuses, and whether there is any."""
+    medium = model.medium
+    if model.vapour == "transport" and medium.D_p == 0 and not {"D_p", "D_T"} & set(model.named):
+        words = "vapour diffused as in kinetic theory, by T^1.75/p (parameters: D_p and D_T)"
+        kinetic = changed("diffusivity", words, medium=replace(medium, D_p=1.0, D_T=1.75))
+        yield replace(kinetic, options=_as_options({}, parameters={"D_p": "1", "D_T": "1.75"}))
     if medium.p_v and "p_v" not in model.named:
         yield changed("vapour", "there were no vapour in the bubble", NO_VAPOUR, medium=replace(medium, p_v=0.0))
     elif model.vapour != "none":  # and p_v is no parameter
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
     elif "p_v" not in model.named:
-        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", SATURATED, medium=saturated)
-    yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
-    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
-    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")
+        words = "vapour filled the bubble (vapour_pressure: saturated)"
+        yield changed("vapour", words, SATURATED, medium=_saturated(medium))

@@ -152,6 +152,24 @@ def test_a_wrong_unit_is_asked_for(factor: float) -> None:
     assert "are the units of both columns right?" in doubt(usual(factor), WATER_25C)
 
 
+def test_of_a_bubble_in_mm_no_viscosity_explains_the_slowness() -> None:
+    """No bound holds for so small a bubble: in a thick gel it creeps."""
+    words = doubt(usual(1e3, 0.4e-6), WATER_25C)
+    assert words.startswith("the collapse takes 1000 of the Rayleigh time")
+    assert "(are the units of both columns right?), or the gel is thicker" in words
+    assert "allows" not in words
+
+
+def test_members_that_rest_are_no_reason_to_believe_a_wrong_unit() -> None:
+    """They move by a hundredth, as at the end of a growth, whose parabola is no collapse."""
+    view = usual(1e-3)
+    t = np.linspace(0, view.t_c, 40)
+    R = view.R_max * (1 - (t / view.t_c) ** 2) ** 0.4
+    resting = np.full((2, 40), view.R_max) * (1 - 0.01 * (t / view.t_c) ** 2)
+    (told,) = doubts(t, R, resting, {}, WATER_25C)
+    assert "are the units of both columns right?" in told.words
+
+
 def test_a_window_that_ends_before_the_collapse_tells_nothing() -> None:
     view = usual(0.5)
     t = np.linspace(0, view.t_c, 40)

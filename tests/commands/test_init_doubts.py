@@ -35,6 +35,26 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert f"{told}Units 1000 times larger would make it a usual one" in done.stderr
 
 
+def test_a_file_of_several_shots_is_proposed_for_the_first_and_said_to_be_one(tmp_path: Path) -> None:
+    """The window ended with the last shot where the first has no second minimum."""
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    cells = [[float(cell) for cell in row.split(",")] for row in rows]
+    later = [f"{t + 1e3:.9g},{0.9 * r:.9g}" for t, r in cells]
+    Path("shots.csv").write_text("\n".join([head, *rows, *later, ""]))
+    told = {name: call("init", "--data", f"{name}.csv", *UNITS).stderr for name in ("b", "shots")}
+    words = f"behind {cells[-1][0]:.6g} us another bubble begins"
+    assert [words in it for it in told.values()] == [False, True]
+    one, shots = (build(load_config(f"{name}.yaml"))[0] for name in told)
+    assert len(shots.observations) == len(one.observations)
+
+
+def test_a_driven_bubble_whose_times_are_in_another_unit_is_noticed() -> None:
+    simulate("acoustic", "5 us:28 us:1 us", "1.4 um", Path("pulse.csv"))
+    told = [call("init", "--data", "pulse.csv", "--time-unit", unit, "--radius-unit", "um", "--start", "acoustic",
+                 "--out", f"{unit}.yaml").stderr for unit in ("us", "ns", "ms")]  # fmt: skip
+    assert ["are the units of both columns right?" in it for it in told] == [False, True, True]
+
+
 def _in_other_units(path: Path) -> str:
     """The same bubble in ms and mm, under the same names."""
     head, *rows = path.read_text().splitlines()

@@ -16,7 +16,7 @@ from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
-from en4dvar_bubble.collapse import doubt
+from en4dvar_bubble.collapse import FAR, doubt
 from en4dvar_bubble.laws.base import ConstitutiveLaw
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
@@ -238,7 +238,8 @@ def doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
     doubts: dict[str, list[str]] = {}
     for name, view in looks.items():
         holds_gas = np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
-        bounded = not holds_gas and view.lobe.rayleigh_ratio(model.medium) > 1  # a gel stretched far stiffens
+        ratio = view.lobe.rayleigh_ratio(model.medium)
+        bounded = (not holds_gas and ratio > 1) or ratio < 1 / FAR  # a gel stretched far stiffens
         if (model.start == "laser" or bounded) and (words := doubt(view.lobe, model.medium)):
             doubts.setdefault(words, []).append(name)
     return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]
