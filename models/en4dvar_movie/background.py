@@ -16,6 +16,7 @@ from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie, saturated
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
 from en4dvar_movie.surfaces import FLICKER, flashes_first, is_round, smooth_surface, surface_beside_discs
+from en4dvar_movie.uncertainty import with_hidden
 
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
@@ -42,7 +43,7 @@ NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the n
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
-AROUND, CLIPPED, HALF = 5.0, 0.25, 0.5  # pixels beside an edge; the share saturated that hides its place; by how much
+AROUND = 5.0  # pixels beside an edge
 BESIDE, EDGE = 3, 1.5  # pixels about a rim, or along the border, that are compared; std of the blur before that
 FIRST = 0.25  # share of the edges of what changes that tells that the first frame shows a bubble
 DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
@@ -430,8 +431,8 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
     optics = _shared([o for _, o in shown], background.noise)
-    if np.median(clipped) > CLIPPED:
-        optics = replace(optics, hidden=max(HALF, optics.width))
+    grey = float(np.nanmedian(np.abs(1 / background.gain)))
+    optics = with_hidden(optics, samples, float(np.median(clipped)), grey)
     clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
@@ -442,7 +443,9 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
     rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
     return (
-        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden) if rimmed else optics
+        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden, hides=optics.hides)
+        if rimmed
+        else optics
     )
 
 

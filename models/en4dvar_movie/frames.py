@@ -5,7 +5,7 @@ Movies are written frame by frame as well: TIFF with its scale, or a video.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -28,6 +28,8 @@ IMAGES = (".png", ".bmp", ".jpg", ".jpeg")
 LEAST_SIDE = 16
 PLAYED = 30  # frames a second, of a video that is written
 MOVIES = Allowed(seconds=20, memory=2_000_000_000, size=256_000_000_000)
+COUNTED = 20  # pixels to a level that tell the next
+PULLED, FLAT = 3.0, 0.05  # steps of rare levels between common ones, and off an even histogram, of one made even
 COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
 
 
@@ -94,6 +96,22 @@ def saturated(frames: Iterable[Frame]) -> float:
     most = max(float(np.nanmax(frame)) if frame.dtype.kind in "ui" else np.inf for frame in frames)
     full = max(float(2 ** np.ceil(np.log2(most + 1))) - 1, 255.0)
     return most - 1.5 if most > 0.99 * full else full
+
+
+def steps_of(frames: Sequence[Frame]) -> tuple[float, bool]:
+    """From the brightness of most pixels to the next one that a frame holds, in the median over frames of integers; and
+    whether a histogram was equalised: that is further than between the rarest, or of all brightness there is as much.
+    """
+    steps, even = [0.0], [False]
+    for frame in frames:
+        values, counts = np.unique(frame if frame.dtype.kind in "ui" else 0, return_counts=True)
+        if len(values) > 1 and frame.size > COUNTED * len(values):
+            gaps = np.diff(values.astype(float), prepend=2.0 * values[0] - values[1])
+            order = np.argsort(gaps)
+            steps.append(float(gaps[order][np.searchsorted(np.cumsum(counts[order]), frame.size / 2)]))
+            off = np.max(np.abs(np.cumsum(counts) / frame.size - values / values[-1]))
+            even.append(steps[-1] >= PULLED * np.percentile(gaps, 10) or off < FLAT)
+    return float(np.median(steps)), bool(np.median(even))
 
 
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:
