@@ -41,10 +41,12 @@ def burnt_in(frames: Sequence[Frame]) -> Mask:
 def margins(frames: Sequence[Frame]) -> Mask:
     """Rows and columns of one brightness that stand about the picture in all frames (H, W), as a canvas does."""
     films = np.array(frames, dtype=np.float32)
-    added = np.zeros(films.shape[1:], dtype=bool)
+    added, may_vary = np.zeros(films.shape[1:], dtype=bool), SAME * films.max()
     for turn in range(4):  # each side as the upper one
         turned = np.rot90(films, turn, (1, 2))
-        other = np.mean(np.abs(turned - turned[0, 0, 0]) > SAME * films.max(), axis=2).T  # of each row and frame
+        if np.ptp(turned[:, 0]) > may_vary:
+            continue
+        other = np.mean(np.abs(turned - turned[0, 0, 0]) > may_vary, axis=2).T  # of each row and frame
         rows = int(np.argmax(other.any(axis=1)))
         if rows and other[rows].min() > MOSTLY:
             np.rot90(added, turn)[: rows + BURNT[2]] = True
