@@ -10,11 +10,13 @@ from scipy import ndimage
 
 from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.burnt import burnt_in, margins
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie, saturated
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
 from en4dvar_movie.surfaces import FLICKER, flashes_first, is_round, smooth_surface, surface_beside_discs
+from en4dvar_movie.uncertainty import with_hidden
 
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
@@ -41,7 +43,7 @@ NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the n
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
-AROUND, CLIPPED, HALF = 5.0, 0.25, 0.5  # pixels beside an edge; the share saturated that hides its place; by how much
+AROUND = 5.0  # pixels beside an edge
 BESIDE, EDGE = 3, 1.5  # pixels about a rim, or along the border, that are compared; std of the blur before that
 FIRST = 0.25  # share of the edges of what changes that tells that the first frame shows a bubble
 DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
@@ -55,8 +57,6 @@ DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: w
 SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
 MOVES = 0.05  # of the light: std on an edge that moves
 APERTURE = (2, 6, 12)  # pixels beside it: where the light is blurred, tells that it ends there, and tells the lamp
-WHITE, SMALL, SHARP = 0.95, 0.1, 0.15  # of the brightest, and of a frame: what is burnt in; of its step: what is blur
-BURNT = ((0, 1), (3, 6), 2)  # pixels from it: where no lens shows a step, where the light is its own, what is left out
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,12 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         white = leading[0].dtype.kind in "ui" and leading[0].flat[0] == np.iinfo(leading[0].dtype).max
         words = "black" if not np.any(first) else "white" if white else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
-    burnt = unseen = _burnt_in(samples)
-    nearest = tuple(ndimage.distance_transform_edt(burnt, return_distances=False, return_indices=True))
+    burnt = burnt_in(samples)
+    unseen = burnt | margins(samples)
+    nearest = tuple(ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True))
     drift = drift_of([frame[nearest] for frame in samples], numbers)  # what is burnt in does not drift
     if drift is not None:
-        unseen = np.any([np.roll(burnt, np.negative(shift_at(drift, n)), (0, 1)) for n in numbers], axis=0)
+        unseen = np.any([np.roll(unseen, np.negative(shift_at(drift, n)), (0, 1)) for n in numbers], axis=0)
         leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
         samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
         height, width = first.shape
@@ -231,28 +232,6 @@ def _outside(frames: Sequence[Frame]) -> Mask:
         shares.append(np.mean((each[:, edge] / np.maximum(lamp, 1e-6)[:, None]).var(axis=0) > MOVES**2))
     stands = steady > 1 - LIVELY and min(swings) < SWINGS**2 and min(shares) < LIVELY
     return np.asarray(blurred & stands)
-
-
-def _burnt_in(frames: Sequence[Frame]) -> Mask:
-    """What is written into all frames (H, W), such as a scale bar: white, and sharper than a lens shows anything, and
-    apart from the frame's border, from which overexposed needles and walls come.
-    """
-    films = np.array(frames, dtype=np.float32)
-    top = films.max()
-    white: Mask = films.min(axis=0) > WHITE * top
-    if not white.any():
-        return white
-    usual = np.median(films, axis=0)
-    labels, sizes = labelled(ndimage.binary_dilation(white, np.ones((3, 3))))
-    rim = np.pad(np.zeros(np.subtract(white.shape, 2), dtype=bool), 1, constant_values=True)
-    inside = ~np.isin(np.arange(1, len(sizes)), labels[rim & white])
-    off, nearest = ndimage.distance_transform_edt(~white, return_indices=True)
-    of, numbers = labels[tuple(nearest)], np.arange(1, len(sizes))
-    *rings, about = BURNT
-    beside, light = (ndimage.median(usual, of * ((off > a) & (off <= b)), numbers) for a, b in rings)
-    sharp = (top > (1 + STRUCTURE) * light) & (beside - light < SHARP * (top - light))
-    sharp &= inside & (sizes[1:] < SMALL * white.size)
-    return np.asarray(np.isin(of, [n for n in numbers[sharp] if not is_round(labels == n)]) & (off <= about))
 
 
 def _lit_as(frame: Frame, other: Frame) -> Frame:
@@ -452,8 +431,8 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
     optics = _shared([o for _, o in shown], background.noise)
-    if np.median(clipped) > CLIPPED:
-        optics = replace(optics, hidden=max(HALF, optics.width))
+    grey = float(np.nanmedian(np.abs(1 / background.gain)))
+    optics = with_hidden(optics, samples, float(np.median(clipped)), grey)
     clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
@@ -464,7 +443,9 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
     rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
     return (
-        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden) if rimmed else optics
+        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden, hides=optics.hides)
+        if rimmed
+        else optics
     )
 
 

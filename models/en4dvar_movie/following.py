@@ -28,6 +28,7 @@ TOUCH = 5.0  # pixels between outlines that blur together
 ABOUT = 3  # frames to each side that say where the bubble is
 JUMP, JUMP_SHARE = 3.0, 0.35  # pixels, and share of the radius, that a centre may be off
 LEAP, LEAP_SHARE = 2.0, 0.12  # the same of a radius above both its neighbours
+MOVES, STANDS = 1.0, 0.03  # pixels that a radius changes by before and after, and their share that is no change
 RISE, FALL = 2.0, 4.0  # neighbouring speeds by which a radius may lie above, or below, both its neighbours
 FALL_SHARE = 0.6  # of the smaller neighbour
 
@@ -184,7 +185,7 @@ def _jumps(bubble: Chain) -> dict[int, str]:
             far = max(JUMP, JUMP_SHARE * float(np.median(np.concatenate([before, after])[:, 2])))
         if off > far:
             result[int(frame)] = f"jump: the centre is {off:.0f} pixels from where the frames about it show it"
-        elif words := _leap(frames, circles[:, 2], n):
+        elif words := _leap(frames, circles[:, 2], n) or _still(frames, circles[:, 2], n):
             result[int(frame)] = words
     return result
 
@@ -205,6 +206,19 @@ def _leap(frames: Array, radii: Array, n: int) -> str:
         if j - i == 2 and radii[n] < low - FALL * speed - FALL_SHARE * low - LEAP:
             return f"jump: the radius is {low - radii[n]:.0f} pixels below those of the frames about it"
     return ""
+
+
+def _still(frames: Array, radii: Array, n: int) -> str:
+    """Why a radius cannot be that of the frame before; "" where it can."""
+    if not 2 <= n < len(radii) - 1 or frames[n + 1] - frames[n - 2] != 3:
+        return ""
+    before, step, after = np.diff(radii[n - 2 : n + 2])
+    if before * after <= 0 or min(abs(before), abs(after)) < MOVES or abs(step) > STANDS * min(abs(before), abs(after)):
+        return ""
+    return (
+        f"copy: the radius is that of the frame before, but changes by {abs(before):.1f} and {abs(after):.1f} pixels "
+        "before and after; if a copy was put in, later times are late"
+    )
 
 
 def _from_segment(point: Array, a: Array, b: Array) -> float:

@@ -5,7 +5,7 @@ Movies are written frame by frame as well: TIFF with its scale, or a video.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain, replace_file, temporary_folder
@@ -28,6 +29,9 @@ IMAGES = (".png", ".bmp", ".jpg", ".jpeg")
 LEAST_SIDE = 16
 PLAYED = 30  # frames a second, of a video that is written
 MOVIES = Allowed(seconds=20, memory=2_000_000_000, size=256_000_000_000)
+COUNTED = 20  # pixels to a level that tell the next
+PULLED, FLAT = 3.0, 0.05  # steps of rare levels between common ones, and off an even histogram, of one made even
+MOSAIC = 0.03  # of the mean of four pixels: by which those of a mosaic differ, beside their scatter
 COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
 
 
@@ -54,7 +58,7 @@ class Movie:
     def frames(self) -> Iterator[Frame]:
         """Frames (H, W), all of one shape. Raises :class:`DataError`, which names the frame."""
         shape: tuple[int, ...] = ()
-        number, channel = -1, 0
+        number, channel, even = -1, 0, None
         before: Frame | None = None
         noisy = False
         try:
@@ -67,9 +71,21 @@ class Movie:
                         self.notes.append(words)
                 where = self._where(number)
                 frame = _grey(read, channel, where)
-                shape = shape or frame.shape
+                if not shape:
+                    shape, even = frame.shape, _evened(frame)
+                    words = (
+                        f"{self.path}: pixels differ in a pattern of 2 × 2, as in raw frames of a colour camera: their "
+                        "brightness is made even"
+                    )
+                    self.notes.extend([words] * (even is not None and words not in self.notes))
                 if frame.shape != shape:
                     raise DataError(f"{where} is {_size(frame.shape)}, the first {_size(shape)}")
+                if even is not None:
+                    whole = frame.dtype.kind in "ui"
+                    light = frame * even
+                    frame = (np.minimum(light.round(), np.iinfo(frame.dtype).max) if whole else light).astype(
+                        frame.dtype
+                    )
                 differs = 0.0 if before is None else float(np.mean(frame != before))
                 if differs:
                     noisy = differs > 0.5  # in what stands still, too
@@ -94,6 +110,22 @@ def saturated(frames: Iterable[Frame]) -> float:
     most = max(float(np.nanmax(frame)) if frame.dtype.kind in "ui" else np.inf for frame in frames)
     full = max(float(2 ** np.ceil(np.log2(most + 1))) - 1, 255.0)
     return most - 1.5 if most > 0.99 * full else full
+
+
+def steps_of(frames: Sequence[Frame]) -> tuple[float, bool]:
+    """From the brightness of most pixels to the next one that a frame holds, in the median over frames of integers; and
+    whether a histogram was equalised: that is further than between the rarest, or of all brightness there is as much.
+    """
+    steps, even = [0.0], [False]
+    for frame in frames:
+        values, counts = np.unique(frame if frame.dtype.kind in "ui" else 0, return_counts=True)
+        if len(values) > 1 and frame.size > COUNTED * len(values):
+            gaps = np.diff(values.astype(float), prepend=2.0 * values[0] - values[1])
+            order = np.argsort(gaps)
+            steps.append(float(gaps[order][np.searchsorted(np.cumsum(counts[order]), frame.size / 2)]))
+            off = np.max(np.abs(np.cumsum(counts) / frame.size - values / values[-1]))
+            even.append(steps[-1] >= PULLED * np.percentile(gaps, 10) or off < FLAT)
+    return float(np.median(steps)), bool(np.median(even))
 
 
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:
@@ -141,6 +173,23 @@ def _channel(read: Any) -> tuple[int, bool]:
         return 0, False
     colours, full = frame[..., :3], np.iinfo(frame.dtype).max if frame.dtype.kind in "ui" else 1.0
     return int(np.argmax(colours.mean(axis=(0, 1)))), float(np.mean(np.ptp(colours, axis=2))) > COLOUR * full
+
+
+def _evened(frame: Frame) -> Array | None:
+    """Factors (H, W) that make a colour camera's mosaic as even as its brightest quarter; None where there is none."""
+    height, width = (side - 1 for side in frame.shape)
+    fours = np.array([frame[j : height + j : 2, i : width + i : 2] for j in (0, 1) for i in (0, 1)], dtype=float)
+    mean = fours.mean(axis=0)
+    lit = (mean > 0) & (mean >= mean.mean())
+    shares = fours[:, lit] / mean[lit]
+    if not shares.size:
+        return None
+    usual = np.median(shares, axis=1)
+    scatter = np.median(np.abs(shares - usual[:, None]))
+    if usual.min() <= 0 or np.max(np.abs(usual - 1)) < max(MOSAIC, scatter):
+        return None
+    repeated = np.tile((usual.max() / usual).reshape(2, 2), (height // 2 + 1, width // 2 + 1))
+    return np.asarray(repeated[: height + 1, : width + 1])
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -39,7 +39,7 @@ class Optics:
     that of a frame differs from it, ``noise`` the std of a pixel, and ``even`` that bubbles are evenly dark, so that a
     frame may tell a contrast of its own. ``rim`` is that of :mod:`en4dvar_movie.kernels`: light, distance and width in
     pixels, () without a rim, and ``rim_std`` how well a frame's are known. ``hidden`` is by how many pixels all edges
-    may be off where the frames are saturated beside them.
+    may be off where grey levels tell little of the light, as ``hides`` says.
     """
 
     contrast: float
@@ -51,6 +51,7 @@ class Optics:
     rim: tuple[float, ...] = ()
     rim_std: tuple[float, ...] = ()
     hidden: float = 0.0
+    hides: str = ""
 
 
 @dataclass(frozen=True)

@@ -108,8 +108,8 @@ def track(
         )
     if optics.hidden:
         notes.append(
-            "beside the bubble's edge the frames are saturated, or black and white alone: where in the light's fall it "
-            f"shows is not known, and all radii may be off by {optics.hidden:.1f} pixels alike, which R_common_um holds"
+            f"{optics.hides}: where in the light's fall an edge shows is not known, and all radii may be off by "
+            f"{optics.hidden:.1f} pixels alike, which R_common_um holds; if the camera saved better frames, take those"
         )
     if movie.copies:
         notes.append(

@@ -29,9 +29,8 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "decoders", "numbering", "frames", "kernels", "outline", "fitting", "drifting", "surfaces", "background",
-    "uncertainty",
-    "merged", "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
+    "decoders", "numbering", "frames", "kernels", "outline", "uncertainty", "fitting", "drifting", "surfaces", "burnt",
+    "background", "merged", "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip
 

@@ -248,3 +248,15 @@ def test_a_point_far_from_any_bubble(tmp_path, monkeypatch):
     outcome = CliRunner().invoke(main, words)
     assert outcome.exit_code == 2
     assert "no bubble is seen near 5,5" in outcome.output
+
+
+def test_a_copied_frame_is_doubtful_where_the_wall_moves():
+    """No noise tells it in a compressed video: radii were 4 pixels off, in silence."""
+    radii = np.array([30, 29, 27, 24, 24.02, 16, 10, 9.9, 13, 16, 18, 18.1, 18, 17.9, 17.8])
+    outline = Outline(Circle(0, 0, 1), 1.0, -0.5, 0.01, np.zeros((2, 1)), 1e-4, 1.0, 0.0, 0.1, 1.0)
+    chain = Chain(tuple(Candidate(k, (replace(outline, circle=Circle(0, 0, R)),)) for k, R in enumerate(radii)))
+    words = doubts(chain, [])
+    assert list(words) == [4]
+    assert words[4].startswith("copy: the radius is that of the frame before, but changes by 3.0 and 8.0 pixels")
+    gaps = Chain(tuple(c for c in chain.candidates if c.frame != 2))
+    assert not doubts(gaps, [])

@@ -92,6 +92,21 @@ def test_a_coloured_movie_is_read_in_the_colour_of_its_lamp(tmp_path):
     assert "red" in movie.notes[0]
 
 
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+def test_the_mosaic_of_a_colour_camera_is_made_even(tmp_path, kind):
+    """Of rendered movies 0 to 7 of 44 frames were read, those with radii 9 to 25 pixels too large."""
+    j, i = np.indices((33, 48))
+    light = np.random.default_rng(1).normal(150.0, 4.0, (3, 33, 48)) * (1 - 0.7 * (np.hypot(j - 16, i - 20) < 9))
+    mosaic = np.where((i % 2 == 0) & (j % 2 == 0), 0.6, np.where(i % 2 + j % 2 == 2, 0.4, 1.0))
+    tifffile.imwrite(tmp_path / "m.tif", (light * mosaic).astype(kind), photometric="minisblack")
+    tifffile.imwrite(tmp_path / "n.tif", light.astype(kind), photometric="minisblack")
+    movie, plain = open_movie(tmp_path / "m.tif"), open_movie(tmp_path / "n.tif")
+    np.testing.assert_allclose(np.array(list(movie.frames())), light, atol=9)
+    assert "pattern of 2 × 2" in movie.notes[0]
+    assert np.array_equal(np.array(list(plain.frames())), light.astype(kind))
+    assert not plain.notes
+
+
 def damaged(folder, kind):
     path = folder / {"folder": "empty", "video": "m.mp4", "kind": "m.pdf"}.get(kind, "m.tif")
     if kind == "folder":

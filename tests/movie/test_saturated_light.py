@@ -9,7 +9,9 @@ from scipy import ndimage
 from scipy.special import expit
 
 from en4dvar_movie.background import _outside
+from en4dvar_movie.outline import Optics
 from en4dvar_movie.tracking import track
+from en4dvar_movie.uncertainty import with_hidden
 
 SHAPE, CENTRE = (96, 112), (55.3, 47.6)
 RADII = np.array([14.0, 19, 22, 24, 25, 25, 24, 22, 19, 14, 9, 13, 16, 17, 16, 13])
@@ -34,6 +36,49 @@ def of_8_bit(images):
 
 def off(readings, radii=RADII):
     return np.array([r.radius for r in readings]) - radii - 0.4 / radii
+
+
+def stepped(image, levels):
+    return np.rint(np.rint(image / 255 * (levels - 1)) * 255 / (levels - 1))
+
+
+def equalised(image, power=1.0):
+    counts = np.cumsum(np.bincount(image.ravel(), minlength=256) ** power)
+    return (255 * counts / counts[-1]).round().astype(np.uint8)[image]
+
+
+LEVELS = {
+    "4 levels": (lambda image: stepped(image, 4), "few grey levels"),
+    "8 levels": (lambda image: stepped(image, 8), "few grey levels"),
+    "equalised": (equalised, "equalised the histogram"),
+    "by roots": (lambda image: equalised(image, 0.5), "equalised the histogram"),
+    "64 levels": (lambda image: stepped(equalised(image).astype(float), 64), "equalised the histogram"),
+    "smooth": (lambda image: image, ""),
+    "stretched": (lambda image: np.clip(1.4 * image, 0, 255), ""),
+    "16 bit": (lambda image: 200.0 * image + np.random.default_rng(1).integers(0, 200, image.shape), ""),
+}
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_grey_levels_that_tell_little_of_the_light_are_told(name):
+    change, words = LEVELS[name]
+    shown = [change(image).astype(np.uint16 if name == "16 bit" else np.uint8) for image in of_8_bit(filmed())]
+    grey = float(np.ptp(shown[0])) / 0.8
+    optics = with_hidden(Optics(-0.75, 0.6, noise=0.01), shown, 0.0, grey)
+    assert words in optics.hides
+    assert bool(words) == (optics.hidden > 0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["4 levels", "8 levels", "equalised", "by roots"])
+def test_the_common_error_holds_what_few_grey_levels_do(name):
+    """Radii were 0.3 to 0.8 (few levels) and 1.4 pixels (equalised) off, where 0.05 to 0.08 were stated."""
+    shown = [LEVELS[name][0](image).astype(np.uint8) for image in of_8_bit(filmed(empty=2))]
+    result = track(movie_of(shown))
+    readings = result.readings[2:]
+    scores = np.abs(off(readings)) / [np.hypot(r.errors.std, r.errors.common) for r in readings]
+    assert np.nanmedian(scores) < 2.5
+    assert any(LEVELS[name][1] in note for note in result.notes)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from movies import movie_of
 from scipy import ndimage
 from scipy.special import expit
 
-from en4dvar_movie.background import _burnt_in
+from en4dvar_movie.burnt import burnt_in, margins
 from en4dvar_movie.tracking import track
 
 RADII = np.array([*(52 * (1 - np.linspace(-0.95, 0.97, 14) ** 2) ** 0.5), 16, 19, 20, 19, 16, 12, 14, 15, *[13] * 4])
@@ -48,19 +48,19 @@ def test_a_bubble_beside_a_scale_bar_is_read(empty, drift, texture, seed):
 
 def test_a_luminous_bubble_and_an_overexposed_field_are_not_burnt_in():
     frames = [frame.astype(int) for frame in barred()]
-    bar = _burnt_in(frames)
+    bar = burnt_in(frames)
     assert bar[136:152, 88:142].sum() == bar.sum() > 400
     for shown in ([255 - f for f in frames], [2 * (200 - f) for f in frames], [2 * f for f in frames]):
         clipped = np.clip(shown, 0, 255)
         clipped[:, 130:] = 100
-        assert not _burnt_in(clipped.astype(np.uint8)).any()
+        assert not burnt_in(clipped.astype(np.uint8)).any()
     needle = np.array(frames)
     needle[:, 60:64, 130:] = 255  # overexposed, and from the border
-    assert not _burnt_in(needle)[50:74, 100:].any()
-    assert _burnt_in(needle)[136:152, 88:142].sum() == bar.sum()
+    assert not burnt_in(needle)[50:74, 100:].any()
+    assert burnt_in(needle)[136:152, 88:142].sum() == bar.sum()
     wall = np.full((24, 80, 80), 255, dtype=np.uint8)
     wall[:, 50:] = 10  # in a field that is overexposed
-    assert not _burnt_in(wall).any()
+    assert not burnt_in(wall).any()
 
 
 def test_a_bar_before_a_bubble_is_no_border_from_which_the_bubble_comes():
@@ -76,3 +76,23 @@ def test_a_bar_before_a_bubble_is_no_border_from_which_the_bubble_comes():
     read = [r.radius for r in track(movie).readings]
     assert not any("stands still" in note for note in movie.notes)
     np.testing.assert_allclose(read, radii, atol=0.2)
+
+
+@pytest.mark.parametrize("light", [255, 70])
+def test_margins_about_the_pictures_are_no_background(light):
+    """Radii were 50 pixels too large, in silence, of a movie without an empty frame on a white canvas."""
+    pictures = [frame[40:136, 36:132] for frame in barred()[14:22]]
+    frames = [np.pad(picture, ((8, 8), (12, 6)), constant_values=light) for picture in pictures]
+    assert not margins(pictures).any()
+    part = margins(frames)
+    assert part.sum() == part.size - part[10:-10, 14:-8].size
+    assert not part[10:-10, 14:-8].any()
+    result = track(movie_of(frames))
+    radii = np.array([r.radius if r.used else np.nan for r in result.readings])
+    np.testing.assert_allclose(radii, RADII[14:22], atol=0.2)
+
+
+def test_overexposed_light_is_no_margin():
+    shown = np.clip([2 * frame.astype(int) for frame in barred()], 0, 255).astype(np.uint8)
+    assert not margins(shown).any()
+    assert not margins([255 * (frame > 100).astype(np.uint8) for frame in barred()]).any()
