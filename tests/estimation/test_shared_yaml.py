@@ -82,7 +82,7 @@ def test_pages(finished, tmp_path):
     write_report(run)
     page = (run / "report.html").read_text()
     assert 'href="joint.html"' in page
-    assert "each data set alone (grey) and all together. " in page
+    assert page.count("each data set alone (grey) and all together. ") == 2  # as drawn, and read aloud
     assert "What they share" in (run / "joint.html").read_text()
     assert all(name in (run / ".en4dvar-files").read_text() for name in ("joint.csv", "joint.html"))
 
