@@ -240,8 +240,14 @@ def test_the_public_movie_to_an_interval(visit, serve, tmp_path):
 
 @pytest.mark.parametrize("width", [1280, 1920, 400])
 def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width):
-    page = visit(serve(two_bubbles[0]), width)
-    until(page, "!!movie?.picture")
+    folder, name = two_bubbles[0], "as_long_as_a_name_may_be" + "_" * 200
+    (folder / f"{name}.csv").write_text("t_us,R_um\n0,1\n1,2\n2,3\n")
+    (folder / f"{name}.yaml").write_text("name: long\n")
+    (folder / "runs" / name).mkdir(parents=True)
+    page = visit(serve(folder), width)
+    page.select_option("#table", f"{name}.csv")
+    page.select_option("#config", f"{name}.yaml")
+    until(page, "!!movie?.picture && table !== null && text.value !== ''")
     page.evaluate(LOOK)
     faint = page.evaluate("window.look.faint()")
     assert faint["seen"] > 40
