@@ -207,7 +207,9 @@ async function showLive(job) {
   const told = job && (await fetched("live", { run: job.out.replace("runs/", ""), columns }).catch(() => null));
   $("live").hidden = !told || !runs("run", "resume");
   if (!told) return;
-  $("log").textContent = told.text;
+  const log = $("log"), follows = log.scrollTop + log.clientHeight >= log.scrollHeight - 2; // not where somebody reads above
+  log.textContent = told.text;
+  if (follows) log.scrollTop = log.scrollHeight;
   $("bands").innerHTML = told.bands;
   $("sets").hidden = !told.sets.length;
   $("sets").tBodies[0].replaceChildren();

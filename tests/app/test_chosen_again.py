@@ -215,6 +215,8 @@ def test_a_finished_run_is_told_by_its_result_alone(visit, serve, two_texts):
     assert "no result yet" in page.inner_text("#live")
     rows = page.eval_on_selector_all("#bands svg .read", "all => new Set(all.map((e) => e.getAttribute('y'))).size")
     assert rows == 3  # of five panels
+    until(page, "log.scrollHeight > log.clientHeight")
+    assert page.locator("#log").evaluate("(e) => e.scrollHeight - e.clientHeight - e.scrollTop") < 1
     assert page.evaluate("fetch('validate', { method: 'POST', body: '{}' }).then((answer) => answer.status)") == 409
     page.evaluate("post('validate', {})")
     until(page, "message.innerText.startsWith('another command is running')")
