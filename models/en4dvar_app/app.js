@@ -69,9 +69,13 @@ function show(now) {
   const first = !state;
   state = now;
   $("folder").textContent = now.folder;
+  const typed = !edited || $("text").value === before || now.configs.includes(edited) ? [] : [edited]; // a text that is in no file
   for (const [id, names, empty] of [["movie", now.movies, now.movies.length ? undefined : "no movie in this folder"],
-    ["table", now.tables, "choose"], ["config", now.configs, "choose"]])
+    ["table", now.tables, "choose"], ["config", [...now.configs, ...typed], "choose"]]) {
+    const gone = $(id).value;
     if (options($(id), names, empty)) changed(id);
+    if (gone && !names.includes(gone)) say(`${gone}: is not in the folder any more.`);
+  }
   if (first) resumeLast().catch((error) => say(error.message));
   for (const button of document.querySelectorAll("button[data-step]")) button.disabled = !!runs(...Object.keys(MINE).filter((s) => s !== "validate"));
   $("cancel").disabled = !busy();
