@@ -142,6 +142,7 @@ UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
 DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 STEADY = 0.6  # correlation of ln R with time in the last quarter of a history that falls to the end, also with ripples
 GAS = 0.6  # of R_max: a bubble at rest is smaller
+QUIET, SETTLES = 0.45, (3.0, 0.5)  # of R_max: the readings from 3 to 0.5 collapse times before another bubble lie below
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 SEVERAL = 4  # readings before a bubble, or at least of one
@@ -180,7 +181,8 @@ class Look:
     below :data:`COLLAPSED` of its maximum. ``n_minima`` follow the maximum with a ``prominence`` relative to the
     range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
     or has a ``hole`` there, told in words, so that the time of the collapse is where a fit goes on to. ``reason`` says
-    in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
+    in words why ``start`` is proposed, ``clear`` whether the data leave no doubt. ``another`` is the instant of the
+    last reading before another bubble, NaN where none follows; what is behind it does not count.
     """
 
     begin: float
@@ -202,6 +204,7 @@ class Look:
     start: Start
     reason: str
     clear: bool
+    another: float = float("nan")
 
     @property
     def resting(self) -> tuple[float, float, str]:
@@ -246,6 +249,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"the first {begins} readings are small beside the bubble, which appears at {when}: ultrasound makes it "
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
+    if chosen == "laser" and (count := _before_another(times, radius, peak)) < len(times):
+        return replace(look(times[:count], radius[:count], start), another=float(times[count - 1]))
     step, falls = float(np.median(np.diff(times))), bool(radius[largest:].min() < COLLAPSED * radius[largest])
     noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
     early, hole = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c), ""
@@ -349,6 +354,19 @@ def _before_a_hole(times: Array, radius: Array) -> int:
             hidden = times[last] < peak.t_max + peak.t_c < times[last + 1] - REBOUND * peak.t_c
             if hidden and radius[last] < FALLS * radius[largest]:
                 return int(last) + 1
+    return len(times)
+
+
+def _before_another(times: Array, radius: Array, peak: Lobe) -> int:
+    """How many readings precede another bubble, as of the next shot of a laser; all. What oscillates by itself does not
+    grow again when it was small for longer than a period."""
+    largest, (begun, ended) = float(radius.max()), SETTLES
+    tall = (radius > GAS * largest) & (times > peak.t_max + (1 + begun) * peak.t_c)
+    for first in np.flatnonzero(tall & ~np.append(False, tall[:-1])):
+        start, stop = np.searchsorted(times, times[first] - np.array([begun, ended]) * peak.t_c)
+        quiet = radius[min(start, stop - 1) : stop].max()
+        if tall[first : first + 3].sum() == 3 and quiet < QUIET * largest:  # two may be wild
+            return int(np.flatnonzero(radius[:first] <= quiet)[-1]) + 1
     return len(times)
 
 

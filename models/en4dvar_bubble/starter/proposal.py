@@ -51,6 +51,10 @@ NUCLEUS = (0.66e-6, 0.8)  # m; both gels of Mancia et al. (2021), Table 1: 0.43 
 WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess had a root mean square of 2.1
 SAME_CLOCK = 2e-6  # s: of a guessed clock
 COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
+ANOTHER = (
+    "{}: behind {:.6g} us another bubble begins, about as large as the first, which had come to rest: give each a file "
+    "of its own, or a column that says whose each row is, and name it by --by; this is a proposal for the first"
+)
 EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
@@ -120,6 +124,7 @@ def propose(
         for name, view in looks.items()
         if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
+    warnings += [ANOTHER.format(name, 1e6 * view.another) for name, view in looks.items() if np.isfinite(view.another)]
     wrong = "make G wrong by half" if "G" in {*others, *guess.values} else "move an estimate by several error bars"
     warnings += [elsewhere.PULSE.format(wrong)] * (chosen == "acoustic")
     doubted, believed = elsewhere.doubted(looks, model), guess
@@ -294,7 +299,11 @@ def _window(look: Look, views: Sequence[Look]) -> Entry:
     words, until = "what happens before the top is not modelled", ""
     if look.drift and len(views) == 1:
         words, until = f"{words}; {look.drift}: no bubble after its last minimum", f", until: trough {look.n_minima}"
-    return Entry("window", f"{{from: top, to: {_end(views)}{until}{low}}}", words)
+    end = _end(views)
+    if np.isfinite(look.another) and len(views) == 1:
+        last = f"{1e6 * look.another:.9g} us"
+        end, until = end.replace("end", last), until or f", until: {last}"
+    return Entry("window", f"{{from: top, to: {end}{until}{low}}}", words)
 
 
 def _end(views: Sequence[Look], number: int = 2) -> str:
