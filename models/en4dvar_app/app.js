@@ -2,9 +2,10 @@
 const $ = (id) => document.getElementById(id);
 const MINE = {
   track: ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw"],
-  init: ["table", "sheet", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start"],
+  init: ["table", "sheet", "time-column", "time-unit", "radius-column", "radius-unit", "table-pixel", "table-frame-rate", "by", "law", "medium", "start"],
   validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
 };
+const option = (id) => id.replace("table-", ""); // of the command
 const BOX = { prior: "validate", resume: "run", export: "compare" };
 // A prior of the text: '  G: {prior: lognormal, median: 3.6 kPa, log_std: 1.6} # why'.
 const PRIOR = /^(\s+)(\w+)(: \{prior: \w+, (?:[^{}]*, )?(?:median|mean): )([^\s,}]+)( ?)([^,}]*)(, (?:log_std|logit_std|std): )([^,}]+)([,}].*)$/;
@@ -47,13 +48,13 @@ function options(select, names, empty) {
 function recall(step) {
   const [of, ...ids] = MINE[step], name = $(of).value, last = state.jobs.findLast((job) => job.step === step && job.subject === name);
   const known = { ...last?.options, ...JSON.parse(sessionStorage.getItem(`${step} ${name}`)) };
-  for (const id of ids) $(id).value = known[id] ?? "";
+  for (const id of ids) $(id).value = known[option(id)] ?? "";
   return known;
 }
 
 function remember(step) {
   const [of, ...ids] = MINE[step];
-  sessionStorage.setItem(`${step} ${$(of).value}`, JSON.stringify(Object.fromEntries(ids.map((id) => [id, $(id).value]))));
+  sessionStorage.setItem(`${step} ${$(of).value}`, JSON.stringify(Object.fromEntries(ids.map((id) => [option(id), $(id).value]))));
 }
 
 const changed = (id) => $(id).dispatchEvent(new Event("change"));
@@ -289,7 +290,7 @@ async function begun(step) {
   if (step === "validate") checks = false;
   if (["validate", "prior", "run", "resume"].includes(step) && !(await keep())) return;
   if (step === "track" && movie && !(await keepCorrections())) return;
-  const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [id, $(id).value]));
+  const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [option(id), $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
   await post(step, fields);
   await refresh();

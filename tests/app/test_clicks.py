@@ -278,3 +278,25 @@ def test_a_file_that_is_dropped_on_the_page_is_told_where_to_go(visit, serve, ge
     until(page, "[...$('table').options].some((o) => o.value === 'mine.csv')")
     page.select_option("#table", "mine.csv")
     until(page, "document.getElementById('about-table').innerText.startsWith('mine.csv. Units are those at')")
+
+
+def test_a_table_in_pixels_and_frames_has_fields_for_both(visit, serve, tmp_path):
+    """The page told to add --pixel and --frame-rate, for which it had no fields."""
+    rows = (ROOT / "configs" / "data" / "laser_halved.csv").read_text(encoding="utf-8").splitlines()[4:]
+    lines = [f"{n},{float(row.split(',')[1]) / 2.5:.2f}\n" for n, row in enumerate(rows)]
+    (tmp_path / "film.csv").write_text("frame,R_px\n" + "".join(lines))
+    server = serve(tmp_path)
+    page = visit(server)
+    page.select_option("#table", "film.csv")
+    until(page, "table !== null")
+    done(page, "init", "failed")
+    words = proposed(page, "", table_pixel="2.5 um", table_frame_rate="714 kHz")
+    assert words[:4] == ["init", "--data=film.csv", "--time-column=frame", "--radius-column=R_px"]
+    assert set(words[4:]) == {"--frame-rate=714 kHz", "--pixel=2.5 um", "--out=film.yaml"}
+    assert 'unit: "2.5*um"' in page.input_value("#text")
+    page.reload()
+    until(page, "table !== null")
+    for each in (page, visit(server)):
+        each.select_option("#table", "film.csv")
+        until(each, "table !== null")
+        assert [each.input_value(f"#table-{field}") for field in ("pixel", "frame-rate")] == ["2.5 um", "714 kHz"]
