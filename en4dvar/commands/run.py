@@ -89,7 +89,8 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
             shown[outcome.name] = outcome.summary
         spread.add(outcome.summary)
         warnings.add(outcome.name, outcome.warnings)
-    echo(results_table(shown) if few else str(spread))
+    if spread:
+        echo(results_table(shown) if few else str(spread))
     for remark in campaign.outcomes[0].remarks if len(campaign.outcomes) == 1 else ():
         echo(f"{campaign.outcomes[0].name}: {remark}")
     _tell_what_sets_share(campaign.directory, warnings)

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     import pandas as pd
 
-from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.analysis import Analysis, FieldEstimate
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift, exclusion, is_manifold
@@ -98,9 +98,9 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
 
 
 def remarks(a: Analysis) -> tuple[str, ...]:
-    """Remarks below the table on the terminal: whether there is a change in what may vary, what the error bars of the
-    path's parameters are made of, how the readings after the window came out, and the alternatives that move a
-    parameter beyond its error bar.
+    """Remarks below the table on the terminal: how far fields are narrowed, whether there is a change in what may vary,
+    what the error bars of the path's parameters are made of, how the readings after the window came out, and the
+    alternatives that move a parameter beyond its error bar.
     """
     used = len(a.problem.observations.used)
     excluded = {s.name: exclusion(a.fit[0], used, s.misfit_change) for s in a.what_if}
@@ -119,7 +119,15 @@ def remarks(a: Analysis) -> tuple[str, ...]:
         rows = counted(sum(shift.settled for shift in a.what_if), "row")
         lines.insert(0, f"the intervals contain {rows} of the what-if table, each as one standard deviation")
     lines[:0] = [words for name in known if (words := budget_words(a, name))]
+    lines[:0] = [_narrowed(estimate) for estimate in a.fields]
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
+
+
+def _narrowed(of: FieldEstimate) -> str:
+    field, stds = of.prior.field, (math.sqrt(np.mean(std**2)) for std in (of.prior_std, of.std))
+    before, after = (f"{std:.3g} {field.unit}".removesuffix(" 1") for std in stds)
+    words = f"standard deviation {after} after the readings, {before} before them (root mean square)"
+    return f"{field.name} of {counted(field.size, 'cell')}: {words}; see the report"
 
 
 def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
@@ -163,6 +171,9 @@ class Estimates:
         for row in summary:
             self._counts[row.name, row.unit] += 1
             self._values.setdefault((row.name, row.unit), []).extend([] if row.untrusted else [row.middle])
+
+    def __bool__(self) -> bool:
+        return bool(self._counts)
 
     def __str__(self) -> str:
         lines = [["parameter", "unit", "data sets", "to be trusted", "5 % of them", "median", "95 % of them"]]

@@ -144,8 +144,8 @@ def _headlines(run_dir: Path) -> list[Headline]:
     if (run_dir / JOINT).exists():
         shared = load_joint(run_dir / JOINT)
         lines = [upper_first(line) for line in together.joint_lines(shared)]
-        figure = together.joint_figure(shared)
-        headlines.append(("joint.html", "All of them together", lines, figure, together.SHARED, shared.cautions))
+        figure, caption = together.joint_figure(shared), together.joint_caption(shared)
+        headlines.append(("joint.html", "All of them together", lines, figure, caption, shared.cautions))
     return headlines
 
 

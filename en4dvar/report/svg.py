@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from en4dvar.report.paper import save_chart
 from en4dvar.report.text import math_pieces
 
 GAP = 6.0  # between panels
+SPACE = 3.0  # between their numbers below
 FONT, SMALL = 8.0, 7.0
 EM = 0.56  # width of a character on average, of its height
 WIDEST = 0.64  # the same of digits and small letters in the widest of the usual fonts (DejaVu Sans, Verdana)
@@ -64,11 +66,14 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
         for j, panel in enumerate(row.panels):
             key = (len(row.panels) if j else 0, j)
             margins[key] = max(margins.get(key, 0.0), _left(panel))
-    of_rows = [[margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))] for row in chart.rows]
-    rooms = [(chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts) for lefts in of_rows]
-    right = max((_right(row.panels[-1], room) for row, room in zip(chart.rows, rooms, strict=True)), default=0.0)
-    for i, (row, lefts) in enumerate(zip(chart.rows, of_rows, strict=True)):
-        x, width = 0.0, rooms[i] - max(0.0, right - GAP) / len(lefts)
+    for row, (_, room) in zip(chart.rows, _laid(chart, margins), strict=True):
+        for j, (panel, following) in enumerate(pairwise(row.panels), 1):
+            between = _beyond(panel, room)[1] + _beyond(following, room)[0] + SPACE - GAP
+            margins[len(row.panels), j] = max(margins[len(row.panels), j], min(between, room / 2))
+    laid = _laid(chart, margins)
+    ends = [_beyond(row.panels[-1], room)[1] for row, (_, room) in zip(chart.rows, laid, strict=True)]
+    for i, (row, (lefts, room)) in enumerate(zip(chart.rows, laid, strict=True)):
+        x, width = 0.0, room - (max(GAP, *ends) - GAP) / len(lefts)
         for j, (panel, left) in enumerate(zip(row.panels, lefts, strict=True)):
             parts += _panel(panel, row, top, x + left, width, f"{name}-{i}-{j}")
             x += left + width + GAP
@@ -80,13 +85,20 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
     return Markup(f"{head}{''.join(parts)}</svg>")
 
 
-def _right(panel: Panel, width: float) -> float:
-    """Points that the numbers below reach beyond an axis of ``width``."""
+def _laid(chart: Chart, margins: dict[tuple[int, int], float]) -> list[tuple[list[float], float]]:
+    """Of each row: what is left of its panels, and the width of each."""
+    rows = [[margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))] for row in chart.rows]
+    return [(lefts, (chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts)) for lefts in rows]
+
+
+def _beyond(panel: Panel, width: float) -> tuple[float, float]:
+    """Points that the numbers below reach beyond an axis of ``width``, on its left and on its right."""
     if panel.bare or panel.names or not panel.x_numbers:
-        return 0.0
+        return 0.0, 0.0
     axis = Frame(0, 0, width, 0, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
-    placed = _placed(panel.x_ticks(), axis.across)
-    return max((x + len(text) * WIDEST * SMALL / 2 - width for x, text in placed), default=0)
+    placed = [(x, len(text) * WIDEST * SMALL / 2) for x, text in _placed(panel.x_ticks(), axis.across)]
+    beyond = [(half - x, x + half - width) for x, half in placed] or [(0.0, 0.0)]
+    return max(left for left, _ in beyond), max(right for _, right in beyond)
 
 
 def _left(panel: Panel) -> float:

@@ -105,10 +105,10 @@ def joint_figure(joint: StoredJoint) -> str:
     """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
     held = [name for name in joint.shared if name in joint.rest]
     shared = {name: joint.rest[name] for name in [n for n in held if not _as_stated(joint, n)] or held}
-    return svg(forest(joint, joint.datasets, shared), "forest", _caption(joint))
+    return svg(forest(joint, joint.datasets, shared), "forest", joint_caption(joint))
 
 
-def _caption(joint: StoredJoint) -> str:
+def joint_caption(joint: StoredJoint) -> str:
     return SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
 
 
@@ -190,7 +190,7 @@ def write_joint(folder: Path) -> Path:
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
         forest=joint_figure(joint),
-        caption=_caption(joint),
+        caption=joint_caption(joint),
         fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
         sets=[*zip(joint.datasets, *fitted, strict=True)],

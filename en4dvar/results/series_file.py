@@ -9,6 +9,7 @@ import numpy as np
 from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Array, Field, Shown
 from en4dvar.plumbing.tables import csv_text
+from en4dvar.plumbing.units import convert
 from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
 from en4dvar.results.netcdf import Group, netcdf_attributes
 from en4dvar.series.moments import SequentialState
@@ -224,10 +225,14 @@ ATTRIBUTES = {"sequence.nc": (*SEQUENCE_ATTRIBUTES, *RUN_ATTRIBUTES), "twin.nc":
 
 
 def estimates(result: SeriesResult) -> list[tuple[str, float, float, str]]:
-    """(name, mean, std, unit) of what is uncertain in the analysis at the last time."""
-    last = result.run.analysis
-    rows = zip(_states(result), last.mean[-1], last.std[-1], strict=True)
-    return [(name, float(mean), float(std), unit) for (name, unit), mean, std in rows if std > 1e-12 * abs(mean)]
+    """(name, mean, std, unit) of what is uncertain in the analysis at the last time, in display units."""
+    last, told = result.run.analysis, []
+    states = zip(_states(result), _states_shown(result), strict=True)
+    for ((name, unit), shown), mean, std in zip(states, last.mean[-1], last.std[-1], strict=True):
+        if std > 1e-12 * abs(mean):
+            value, spread = (float(convert(float(number), unit, shown.display_unit)) for number in (mean, std))
+            told.append((name, value, spread, shown.display_unit))
+    return told
 
 
 def sequence_csv(result: SeriesResult) -> str:

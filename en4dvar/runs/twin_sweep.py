@@ -20,6 +20,7 @@ from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.paper import on_paper
+from en4dvar.report.text import plus_minus
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.provenance import identity
 from en4dvar.runs.engine import RunKind, Session, conduct_run, require_some
@@ -247,4 +248,4 @@ def _text(value: Any) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    return f"{value:.4g}" + (f" ± {error:.2g}" if np.isfinite(error) else "")
+    return plus_minus(value, error) if error > 0 else f"{value:.4g}"

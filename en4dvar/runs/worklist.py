@@ -108,7 +108,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     converged = "converged" if analysis.converged else "not converged"
     ending = f"{converged}: {analysis.stop_reason}; {counted(analysis.forward_runs, 'forward run')}"
     warnings = (f"{warning.severity}: {warning}" for warning in analysis.cautions)
-    told = (f"estimate: {brief(summary)}", ending, *warnings)
+    told = (f"estimate: {brief(summary) or '; '.join(outcome.remarks)}", ending, *warnings)
     return Estimate(content, sha256, encode(outcome), told)
 
 

@@ -157,8 +157,8 @@ def sweep_text(result: SweepResult) -> str:
     lines = [f"{counted(len(result.names), 'data set')}, {result.trajectories} trajectories"]
     for p, *moments in zip(result.parameters, result.mean, result.std, strict=True):
         mean, std = (convert(float(v), p.unit, p.display_unit) for v in moments)
-        spread = f" ± {std:.2g}" if len(result.names) > 1 else ""
+        value = text.plus_minus(mean, std) if std > 0 else f"{mean:.4g}"
         shown = "" if p.display_unit == "1" else f" {p.display_unit}"
-        lines.append(f"  {p.label}: {p.name} = {mean:.4g}{spread}{shown}")
+        lines.append(f"  {p.label}: {p.name} = {value}{shown}")
     fits = result.nrmse
     return "\n".join([*lines, f"  NRMSE {fits.min():.4f} to {fits.max():.4f}, mean {fits.mean():.4f}"])

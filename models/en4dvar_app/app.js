@@ -2,9 +2,10 @@
 const $ = (id) => document.getElementById(id);
 const MINE = {
   track: ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw"],
-  init: ["table", "sheet", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start"],
+  init: ["table", "sheet", "time-column", "time-unit", "radius-column", "radius-unit", "table-pixel", "table-frame-rate", "by", "law", "medium", "start"],
   validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
 };
+const option = (id) => id.replace("table-", ""); // of the command
 const BOX = { prior: "validate", resume: "run", export: "compare" };
 // A prior of the text: '  G: {prior: lognormal, median: 3.6 kPa, log_std: 1.6} # why'.
 const PRIOR = /^(\s+)(\w+)(: \{prior: \w+, (?:[^{}]*, )?(?:median|mean): )([^\s,}]+)( ?)([^,}]*)(, (?:log_std|logit_std|std): )([^,}]+)([,}].*)$/;
@@ -47,13 +48,13 @@ function options(select, names, empty) {
 function recall(step) {
   const [of, ...ids] = MINE[step], name = $(of).value, last = state.jobs.findLast((job) => job.step === step && job.subject === name);
   const known = { ...last?.options, ...JSON.parse(sessionStorage.getItem(`${step} ${name}`)) };
-  for (const id of ids) $(id).value = known[id] ?? "";
+  for (const id of ids) $(id).value = known[option(id)] ?? "";
   return known;
 }
 
 function remember(step) {
   const [of, ...ids] = MINE[step];
-  sessionStorage.setItem(`${step} ${$(of).value}`, JSON.stringify(Object.fromEntries(ids.map((id) => [id, $(id).value]))));
+  sessionStorage.setItem(`${step} ${$(of).value}`, JSON.stringify(Object.fromEntries(ids.map((id) => [option(id), $(id).value]))));
 }
 
 const changed = (id) => $(id).dispatchEvent(new Event("change"));
@@ -69,9 +70,13 @@ function show(now) {
   const first = !state;
   state = now;
   $("folder").textContent = now.folder;
+  const typed = !edited || $("text").value === before || now.configs.includes(edited) ? [] : [edited]; // a text that is in no file
   for (const [id, names, empty] of [["movie", now.movies, now.movies.length ? undefined : "no movie in this folder"],
-    ["table", now.tables, "choose"], ["config", now.configs, "choose"]])
+    ["table", now.tables, "choose"], ["config", [...now.configs, ...typed], "choose"]]) {
+    const gone = $(id).value;
     if (options($(id), names, empty)) changed(id);
+    if (gone && !names.includes(gone)) say(`${gone}: is not in the folder any more.`);
+  }
   if (first) resumeLast().catch((error) => say(error.message));
   for (const button of document.querySelectorAll("button[data-step]")) button.disabled = !!runs(...Object.keys(MINE).filter((s) => s !== "validate"));
   $("cancel").disabled = !busy();
@@ -207,7 +212,9 @@ async function showLive(job) {
   const told = job && (await fetched("live", { run: job.out.replace("runs/", ""), columns }).catch(() => null));
   $("live").hidden = !told || !runs("run", "resume");
   if (!told) return;
-  $("log").textContent = told.text;
+  const log = $("log"), follows = log.scrollTop + log.clientHeight >= log.scrollHeight - 2; // not where somebody reads above
+  log.textContent = told.text;
+  if (follows) log.scrollTop = log.scrollHeight;
   $("bands").innerHTML = told.bands;
   $("sets").hidden = !told.sets.length;
   $("sets").tBodies[0].replaceChildren();
@@ -283,7 +290,7 @@ async function begun(step) {
   if (step === "validate") checks = false;
   if (["validate", "prior", "run", "resume"].includes(step) && !(await keep())) return;
   if (step === "track" && movie && !(await keepCorrections())) return;
-  const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [id, $(id).value]));
+  const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [option(id), $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
   await post(step, fields);
   await refresh();

@@ -71,4 +71,5 @@ class Logarithm:
     batched: ClassVar[bool] = True
 
     def __call__(self, trajectory: Any) -> np.ndarray:
-        return np.asarray(np.log(trajectory[self.name]))
+        with np.errstate(divide="ignore"):  # what has died out to 0 has -inf, which no reading is
+            return np.asarray(np.log(trajectory[self.name]))

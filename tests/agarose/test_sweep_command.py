@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import en4dvar
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.sampling.sweep import SweepResult
 from en4dvar_agarose.commands import sweep as sweep_command
+from en4dvar_agarose.tables import sweep_text
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -36,3 +40,11 @@ def test_command(tmp_path):
     assert isinstance(CliRunner().invoke(sweep_command, [*call, "--force", "--resume"]).exception, ConfigError)
     assert CliRunner().invoke(sweep_command, [*other, "--force"]).exit_code == 0
     assert CliRunner().invoke(sweep_command, [*call, "--shift", "1 kPa"]).exit_code == 2
+
+
+def test_mean_and_spread_have_the_same_decimals():
+    """It read "G = 8.059 ± 3.4 kPa" and "R0 = 0.8405 ± 0.9 um"."""
+    G, shift = Parameter("G", "Pa", label="shear modulus", display_unit="kPa"), np.zeros(2)
+    both = SweepResult(("a", "b"), (G,), np.array([[4659.0], [11459.0]]), shift, np.full(2, 0.9), 1)
+    assert "  shear modulus: G = 8.1 ± 3.4 kPa\n" in sweep_text(both)
+    assert "  shear modulus: G = 4.659 kPa\n" in sweep_text(both.part(slice(1)))

@@ -184,6 +184,25 @@ def test_changes_of_a_text_are_there_again_after_another_was_looked_at(visit, se
     assert (two_texts / "two.yaml").read_text() == typed
 
 
+def test_a_text_whose_file_is_gone_stays_until_it_is_left(visit, serve, two_texts):
+    """The field was empty at the next look at the folder, without a word."""
+    page, typed, file = visit(serve(two_texts)), TEXT + "# an hour of typing\n", two_texts / "one.yaml"
+    opened(page, "one.yaml")
+    page.fill("#text", typed)
+    file.unlink()
+    until(page, "!state.configs.includes('one.yaml')")
+    assert page.input_value("#text") == typed
+    page.click("#keep")
+    until(page, "message.innerText === 'one.yaml: is not in the folder any more'")
+    file.write_text(TEXT)
+    page.click("#keep")
+    until(page, "before === text.value")
+    assert file.read_text() == typed
+    file.unlink()
+    until(page, "message.innerText === 'one.yaml: is not in the folder any more.'")
+    assert page.input_value("#config") == page.input_value("#text") == ""
+
+
 def test_every_prior_has_its_fields_or_is_told_to_be_in_the_text(visit, serve, tmp_path):
     names = ["combined_acoustic", "combined_laser", "laser_varying", "shell", "shell_heard", "acoustic_design"]
     for name in names:
@@ -215,6 +234,8 @@ def test_a_finished_run_is_told_by_its_result_alone(visit, serve, two_texts):
     assert "no result yet" in page.inner_text("#live")
     rows = page.eval_on_selector_all("#bands svg .read", "all => new Set(all.map((e) => e.getAttribute('y'))).size")
     assert rows == 3  # of five panels
+    until(page, "log.scrollHeight > log.clientHeight")
+    assert page.locator("#log").evaluate("(e) => e.scrollHeight - e.clientHeight - e.scrollTop") < 1
     assert page.evaluate("fetch('validate', { method: 'POST', body: '{}' }).then((answer) => answer.status)") == 409
     page.evaluate("post('validate', {})")
     until(page, "message.innerText.startsWith('another command is running')")

@@ -240,8 +240,14 @@ def test_the_public_movie_to_an_interval(visit, serve, tmp_path):
 
 @pytest.mark.parametrize("width", [1280, 1920, 400])
 def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width):
-    page = visit(serve(two_bubbles[0]), width)
-    until(page, "!!movie?.picture")
+    folder, name = two_bubbles[0], "as_long_as_a_name_may_be" + "_" * 200
+    (folder / f"{name}.csv").write_text("t_us,R_um\n0,1\n1,2\n2,3\n")
+    (folder / f"{name}.yaml").write_text("name: long\n")
+    (folder / "runs" / name).mkdir(parents=True)
+    page = visit(serve(folder), width)
+    page.select_option("#table", f"{name}.csv")
+    page.select_option("#config", f"{name}.yaml")
+    until(page, "!!movie?.picture && table !== null && text.value !== ''")
     page.evaluate(LOOK)
     faint = page.evaluate("window.look.faint()")
     assert faint["seen"] > 40
@@ -272,3 +278,25 @@ def test_a_file_that_is_dropped_on_the_page_is_told_where_to_go(visit, serve, ge
     until(page, "[...$('table').options].some((o) => o.value === 'mine.csv')")
     page.select_option("#table", "mine.csv")
     until(page, "document.getElementById('about-table').innerText.startsWith('mine.csv. Units are those at')")
+
+
+def test_a_table_in_pixels_and_frames_has_fields_for_both(visit, serve, tmp_path):
+    """The page told to add --pixel and --frame-rate, for which it had no fields."""
+    rows = (ROOT / "configs" / "data" / "laser_halved.csv").read_text(encoding="utf-8").splitlines()[4:]
+    lines = [f"{n},{float(row.split(',')[1]) / 2.5:.2f}\n" for n, row in enumerate(rows)]
+    (tmp_path / "film.csv").write_text("frame,R_px\n" + "".join(lines))
+    server = serve(tmp_path)
+    page = visit(server)
+    page.select_option("#table", "film.csv")
+    until(page, "table !== null")
+    done(page, "init", "failed")
+    words = proposed(page, "", table_pixel="2.5 um", table_frame_rate="714 kHz")
+    assert words[:4] == ["init", "--data=film.csv", "--time-column=frame", "--radius-column=R_px"]
+    assert set(words[4:]) == {"--frame-rate=714 kHz", "--pixel=2.5 um", "--out=film.yaml"}
+    assert 'unit: "2.5*um"' in page.input_value("#text")
+    page.reload()
+    until(page, "table !== null")
+    for each in (page, visit(server)):
+        each.select_option("#table", "film.csv")
+        until(each, "table !== null")
+        assert [each.input_value(f"#table-{field}") for field in ("pixel", "frame-rate")] == ["2.5 um", "714 kHz"]

@@ -206,6 +206,19 @@ def test_a_panel_says_where_the_pointer_is(opened, pages):
     assert float(up) == pytest.approx((bottom + top) / 2, abs=0.01 * (top - bottom))
 
 
+def test_bars_of_shares_begin_below_each_other(opened, pages):
+    page = opened(pages["set"].with_name("b.html")).page  # without a warning
+    lefts = """() => {
+      for (const fold of document.querySelectorAll("details")) fold.open = true;
+      const rows = [...document.querySelectorAll("table.parameters .percent")];
+      rows.forEach((each, i) => { each.textContent = ["7 %", "−29 %", "100 %"][i % 3]; });
+      return rows.map((each) => Math.round(each.previousElementSibling.getBoundingClientRect().left));
+    }"""
+    found = page.evaluate(lefts)
+    assert len(found) > 2
+    assert len(set(found)) == 1
+
+
 def test_data_sets_are_reached_and_left_by_links(opened, pages):
     page = opened(pages["campaign"]).page
     page.get_by_role("link", name="alpha").click()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner, Result
+from field_models import write_line
 from toy_config import YAML, csv_text, write_toy
 
 from en4dvar.cli import main
@@ -361,6 +362,16 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
     alone = _Warnings()
     alone.add("the population", [caution("chain-not-converged", "few draws")], whole=True)
     assert "the population: few draws" in "\n".join(alone.lines())
+
+
+def test_a_run_of_a_field_alone_tells_how_far_it_is_narrowed(tmp_path: Path) -> None:
+    """The head of a table without rows was all that the terminal showed."""
+    done = call("run", write_line(tmp_path), "--out", tmp_path / "run", "--no-report")
+    told = re.fullmatch(r"line: (u of 30 cells: standard deviation (\S+) K after the readings, .*)\n", done.stdout)
+    assert told, done.output
+    stds = load_result(tmp_path / "run" / "posterior.nc").dataset("fields")["u_std"].values
+    assert float(told[2]) == pytest.approx(np.sqrt(np.mean(stds**2)), rel=0.01)
+    assert f"line: estimate: {told[1]}\n" in (tmp_path / "run" / "run.log").read_text(encoding="utf-8")
 
 
 def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:

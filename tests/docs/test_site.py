@@ -88,6 +88,25 @@ def test_the_reference_is_complete(site):
         assert re.search(rf'id="en4dvar[\w.]*\.{name}"', python), name
 
 
+def test_nothing_runs_out_of_the_screen(site, browser):
+    """Help was cut at the right, names of variables broken within words, and a formula made a page of 696 pixels."""
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((site / "reference_cli.html").as_uri())
+    blocks = "[...document.querySelectorAll('pre > code')].filter((e) => e.scrollWidth > e.clientWidth)"
+    long_examples = "filter((e) => !/^ +en4dvar .{80,}$/m.test(e.innerText))"
+    assert page.evaluate(f"{blocks}.{long_examples}.map((e) => e.innerText)") == []
+    page.goto((site / "reference_netcdf.html").as_uri())
+    words = "[...document.querySelectorAll('td code')].flatMap((e) => [...e.childNodes]).filter((e) => e.data)"
+    lines = "((e) => { const r = new Range(); r.selectNode(e); return r.getClientRects().length; })"
+    assert page.evaluate(f"{words}.filter((e) => /^\\w+$/.test(e.data) && {lines}(e) > 1).map((e) => e.data)") == []
+    assert "``" not in (site / "reference_yaml.html").read_text(encoding="utf-8")
+    page.set_viewport_size({"width": 390, "height": 900})
+    for file in sorted(site.glob("*.html")):
+        page.goto(file.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") == 390, file.name
+    page.close()
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium")
 def test_the_search_works_from_a_file(site):
     command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000", "--dump-dom"]

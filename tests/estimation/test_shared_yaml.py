@@ -80,7 +80,9 @@ def test_pages(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished[1], run)
     write_report(run)
-    assert 'href="joint.html"' in (run / "report.html").read_text()
+    page = (run / "report.html").read_text()
+    assert 'href="joint.html"' in page
+    assert page.count("each data set alone (grey) and all together. ") == 2  # as drawn, and read aloud
     assert "What they share" in (run / "joint.html").read_text()
     assert all(name in (run / ".en4dvar-files").read_text() for name in ("joint.csv", "joint.html"))
 

@@ -19,6 +19,7 @@ from en4dvar.model.forward import Failure
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar_lorenz import Linear, Lorenz63, Lorenz96
+from en4dvar_lorenz.autonomous import Logarithm
 from en4dvar_lorenz.linear import LinearSettings
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
@@ -215,3 +216,8 @@ def test_compiled_code_is_kept_for_later_processes():
         code += "print(list(integrate.stats.cache_hits.values()), list(integrate.stats.cache_misses.values()))\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[1] []\n" * 3
+
+
+def test_a_population_that_has_died_out_has_no_logarithm_and_no_warning():
+    """On the terminal of a design stood "RuntimeWarning: divide by zero encountered in log"."""
+    assert Logarithm("prey")({"prey": np.array([1.0, 0.0])}).tolist() == [0.0, -np.inf]

@@ -222,6 +222,7 @@ def test_a_region_and_a_mask_choose_too():
     [
         (["--bubble", "3"], "write X,Y"),
         (["--region", "0,0,40,10"], "not within the frame of 32 × 32 pixels"),
+        (["--region", "3,3,1,20"], "leave nothing of the frame that a bubble is seen in"),
         (["--region", "0,0,4"], "write X,Y,WIDTH,HEIGHT"),
         (["--mask", "small.png"], "8 × 8 pixels, the frames have 32 × 32"),
         (["--mask", "black.png"], "leave nothing"),

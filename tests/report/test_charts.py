@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -105,6 +106,21 @@ def test_a_number_at_the_end_of_an_axis_stays_within_the_drawing(names):
     text = str(svg(Chart([Row(100.0, panels)], 200.0), "a", "about"))
     end = max(float(x) for x in re.findall(r'x="([\d.]+)"[^>]*>0\.15<', text))
     assert end + 4 * 0.64 * 7 / 2 <= 200.1  # half of its four characters
+
+
+def test_numbers_of_neighbours_keep_apart():
+    """Below members in pairs "0.105" and "0.28" of two panels were written over each other."""
+    first = Panel(xlim=(0.0984, 0.105), xticks=(0.1, 0.105), y_numbers=False)
+    panels = [
+        first,
+        Panel(xlim=(0.279, 0.313), xticks=(0.28, 0.3), y_numbers=False),
+        Panel(xlim=(-500, 500), left=False),
+    ]
+    text = str(svg(Chart([Row(100.0, panels)], 400.0), "a", "about"))
+    numbers = re.findall(r'<text x="([\d.]+)" y="99.0"[^>]*>([^<]+)<', text)
+    ends = [(float(x) - half, float(x) + half) for x, half in ((x, len(word) * 0.64 * 7 / 2) for x, word in numbers)]
+    assert len(ends) > 5
+    assert all(before[1] < after[0] for before, after in pairwise(ends))
 
 
 def test_gaps_stay_gaps_and_what_is_not_finite_is_not_drawn():

@@ -140,6 +140,11 @@ def test_page_says_what_was_estimated_and_how_well(html):
         assert phrase in result_text, phrase
 
 
+def test_settings_are_written_as_in_a_configuration(html):
+    assert "<td>what if</td><td>true</td>" in html
+    assert "<td>localisation</td><td>null</td>" in html  # not as Python writes them
+
+
 def test_colours_follow_the_scheme(html):
     drawings = re.findall(r"<svg.*?</svg>", html, flags=re.S)
     assert all("var(--ink)" in drawing for drawing in drawings)

@@ -72,7 +72,8 @@ def test_no_minus_stands_before_a_rounded_zero():
         (r"$p_{\infty}$", "<i>p</i><sub>∞</sub>"),
         (r"$R_\mathrm{eq}$", "<i>R</i><sub>eq</sub>"),
         (r"$R_\mathrm{<script>}$", "<i>R</i><sub>&lt;script&gt;</sub>"),
-        (r"$\dot R^2$", "<i>dotR</i><sup>2</sup>"),
+        (r"$\dot R^2$", "<i>dot R</i><sup>2</sup>"),
+        (r"$\ln u$", "<i>ln u</i>"),
     ],
 )
 def test_symbols_as_html(symbol, html):

@@ -54,6 +54,8 @@ def test_averages_are_those_of_the_runs(tmp_path):
            and line["assimilation.inflation"] == "1.1" and line["estimate"] == "analysis"]  # fmt: skip
     assert own == rmse
     assert str(found).splitlines()[0].split() == ["scheme", "inflation", "estimate", "runs", "RMSE", "spread"]
+    decimals = {len(a) - len(b) for a, b in re.findall(r"\.(\d+) ± \d+\.(\d+)", str(found))}
+    assert decimals == {0}  # "0.227 ± 0.0022"
 
 
 def test_interrupted_resumed_and_extended(tmp_path):
