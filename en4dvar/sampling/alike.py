@@ -6,6 +6,7 @@ than they fit draws. Exchanged draws miss means by a hundredth, standard deviati
 """
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from en4dvar.ensemble.linalg import sizes
 from en4dvar.model.state import Array, Indices
@@ -26,7 +27,7 @@ def standing_for(x: Array, chosen: Indices, mean: Array, covariance: Array) -> A
     apart = x[chosen] - x[chosen].mean(axis=0)
     if len(chosen) <= n or np.linalg.matrix_rank(apart / sizes(apart)) < n:
         return np.asarray(x[chosen])
-    z = np.linalg.solve(np.linalg.cholesky(np.atleast_2d(covariance)), (x - mean).T).T
+    z = solve_triangular(np.linalg.cholesky(np.atleast_2d(covariance)), (x - mean).T, lower=True).T
     upper = np.triu_indices(n)
     below = x[:, :, None] < np.quantile(x, LEVELS, axis=0).T
     seen = np.hstack([z, z[:, upper[0]] * z[:, upper[1]], below.reshape(len(x), -1)])

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_triangular
 
 from en4dvar.data.noise import Predicted
 from en4dvar.data.observations import Observations
@@ -55,7 +56,8 @@ class Coordinates(NamedTuple):
     def about(cls, points: Array) -> "Coordinates":
         """Those in which points (N, n) have mean zero and standard deviation 1 in every direction."""
         root = np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
-        return cls(points.mean(axis=0), np.asarray(root), np.asarray(np.linalg.inv(root), dtype=float))
+        whiten = solve_triangular(root, np.eye(len(root)), lower=True)  # in which units do not matter
+        return cls(points.mean(axis=0), np.asarray(root), np.asarray(whiten))
 
     def of(self, x: Array) -> Array:
         """z (B, n) of control vectors (B, n)."""

@@ -334,3 +334,18 @@ def test_a_scheme_whose_ensemble_is_twice_as_wide_says_so():
     assert found.posterior["a"].values.std(ddof=1) > 1.3 * exact
     assert found.sample_stats.attrs["gaussian_fit"] > 0.5
     assert "non-gaussian" in found.sample_stats.attrs["warning_codes"]
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_units_do_not_make_a_linear_posterior_doubtful(seed):
+    """A parameter of some 1e-12 beside one of some 1e9, correlated in the posterior."""
+    times, scales = np.linspace(0, 4, 30), dict(zip("abcd", (1e-12, 1e9, 1.0, 1e-3), strict=True))
+    waves = dict(zip("abcd", (np.ones(30), times, np.cos(3 * times), times**2), strict=True))
+    noise = 0.3 * np.random.default_rng(seed).standard_normal(30)
+    result = en4dvar.estimate(
+        lambda p, t: sum(p[name] / scale * waves[name] for name, scale in scales.items()), (times, 3 * times + noise),
+        {name: {"prior": "normal", "mean": scale, "std": 2 * scale} for name, scale in scales.items()}, error=0.3,
+        assimilation={"members": 200}, seed=seed,
+    )  # fmt: skip
+    assert result.sample_stats.attrs["tail_ratio"] == pytest.approx(1, abs=1e-3)
+    assert "non-gaussian" not in {caution.code for caution in result.cautions}
