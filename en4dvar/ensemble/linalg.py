@@ -167,7 +167,7 @@ class Hessian:
             sigma, vectors = np.sqrt(np.maximum(squares[::-1], 0)), vectors.T[::-1]
             return cls(sigma, vectors @ s if small else sigma[:, None] * vectors)
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
-        return cls(sigma, sigma[:, None] * right)
+        return cls(sigma, sigma[:, None] * right, right)
 
     @property
     def prior_precision(self) -> float:

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from toys import Decay, Linear, Wave, make_problem
 
+import en4dvar
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.schemes.settings import AssimilationSettings
@@ -107,3 +108,20 @@ def test_residuals_of_rounding_are_no_finding():
         replace(problem, observations=replace(data, values=exact)), AssimilationSettings(members=20), seed=2
     )
     assert [caution.code for caution in analysis.cautions] == ["overstated-error"]
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "enkf", "enkf-n", "es-mda"])
+def test_filters_of_nearly_exact_readings_end_at_the_closed_form(scheme):
+    """Readings 1e5 times as exact as the prior, which they correct: the mean was up to 150 standard deviations off."""
+    times = np.linspace(0, 4, 30)
+    waves = np.array([np.ones(30), times, np.cos(3 * times), times**2])
+    y = 1.5 * waves.sum(axis=0) + 1e-5 * np.random.default_rng(1).standard_normal(30)
+    result = en4dvar.estimate(
+        lambda p, t: sum(p[name] * wave for name, wave in zip("abcd", waves, strict=True)), (times, y),
+        {name: {"prior": "normal", "mean": 1, "std": 1} for name in "abcd"}, error=1e-5,
+        assimilation={"scheme": scheme, "members": 60},
+    )  # fmt: skip
+    precision = waves @ waves.T * 1e10 + np.eye(4)
+    off = [result.posterior[name].mean().item() for name in "abcd"] - np.linalg.solve(precision, waves @ y * 1e10 + 1)
+    assert np.all(np.abs(off) < 1e-3 * np.sqrt(np.diag(np.linalg.inv(precision))))
+    assert "misfit" not in {caution.code for caution in result.cautions}
