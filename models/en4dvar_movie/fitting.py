@@ -13,6 +13,7 @@ ROUNDS = 30
 CLOSE = (1e-2, 1e-2, 1e-3)  # pixels: the step at which each turn ends
 RIM_SHARE = 0.45  # of the radius: where the bright centre ends, before it is fitted
 SOFT_SHARE = 0.1  # of the radius: over which width it ends beside the blur, before that is fitted
+THIN = 0.9  # of the radius: where the bright centre ends at most
 LEVEL_SPREAD = 0.001  # of the background next to the bubble, in contrasts: halos are not the level of the background
 FIRST_SPREAD = (0.03, 0.0, 0.0)  # of the contrast in the first turns
 LOOSE = 0.1  # how much less is known of the level next to an edge that is blurred
@@ -196,7 +197,7 @@ def _descend(
         trial[parts[1] :] = np.clip(trial[parts[1] :], 0.0, MOST_RIM)
         trial[CONTRAST] = max(trial[CONTRAST], darkest)
         inner = _innermost(trial, trial[slice(*parts)])
-        trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
+        trial[RIM] = np.clip(trial[RIM], 0.1 * inner, THIN * inner)
         trial[SOFT] = np.clip(trial[SOFT], 1e-3 * inner, 0.5 * inner)
         gone = not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape)
         if gone and (not nested or damping > 1e6):  # a single circle that shrinks to nothing is a speck of dirt

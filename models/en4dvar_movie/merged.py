@@ -10,7 +10,7 @@ from en4dvar_movie.outline import Circle, labelled
 
 GRID = 20  # samples to a radius, at most
 QUIET = 2.8  # std of the smoothing that leaves a tenth of the contrast as noise, per noise over contrast
-CENTRE = 0.8  # of the radius: what is bright within is the bubble's own centre
+CENTRE = 0.95  # of the radius: what is bright within is the bubble's own centre
 BRIDGE = 2  # pixels to each side of a gap that is too narrow to part two outlines
 SMALLEST = 0.2  # of the larger radius: a smaller disc is a speck, which a robust fit leaves out
 LONG = 2.0  # samples by which the patch reaches out of the larger disc

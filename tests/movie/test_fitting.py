@@ -65,6 +65,16 @@ def test_a_bright_centre_that_ends_gradually_is_no_smaller_contrast(R, width, en
     assert abs(lens.circle.R - R) < 0.03
 
 
+@pytest.mark.parametrize(("R", "inner"), [(16.0, 0.85), (20.0, 0.85), (16.0, 0.8)])
+def test_a_bright_centre_may_reach_far_out(R, inner):
+    """As of a ring: these radii were 0.23, 0.15 and 0.09 pixels too large."""
+    r = np.hypot(*(np.indices((80, 80)) - 39.2))
+    shade = ndtr((R - r) / 1.1) - 0.9 * ndtr((inner * R - r) / 1.1)
+    light = CONTRAST * shade + 0.005 * np.random.default_rng(5).standard_normal(r.shape)
+    ring = fit_outline(light.astype(np.float32), Circle(39.0, 39.0, R), Optics(CONTRAST, 1.1, 0.05))[0]
+    assert abs(ring.circle.R - R) < 0.03
+
+
 def test_nested_circles_and_their_errors():
     rng = np.random.default_rng(9)
     radii = np.array([25.0, 21.0, 15.0])

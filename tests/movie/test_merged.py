@@ -85,6 +85,7 @@ def discs(*circles, shape=(90, 110), squeeze=1.0):
         discs((50, 45, 40), squeeze=0.5),
         discs((0, 45, 40)),  # cut by the frame
         discs((50, 45, 30)) - discs((50, 45, 15)),  # a bright centre
+        discs((50, 45, 30)) - discs((62, 45, 13.5)),  # one beside the middle
         discs((50, 45, 30)) - discs((28, 45, 8)),  # a glint at the rim
         discs((50, 45, 25), (72, 62, 3)),  # a speck
         np.where(np.indices((90, 110))[0] < 40, np.nan, discs((50, 45, 30))),  # a part is not looked at
