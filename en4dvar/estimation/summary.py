@@ -113,7 +113,9 @@ def remarks(a: Analysis) -> tuple[str, ...]:
         lines.insert(0, change_words(names, a.log_evidence_change))
     if a.withheld is not None:
         share, count = a.withheld.inside, len(a.withheld.values)
-        lines.insert(0, f"after the window: {percent(share)} of {count} readings lie in their 90 % bands")
+        words = f"{percent(share)} of {count} readings lie in their 90 % bands"
+        words = f"the only reading lies {'in' if share else 'outside of'} its 90 % band" if count == 1 else words
+        lines.insert(0, f"after the window: {words}")
     known = [name for name in a.problem.model.path_parameters if name in a.problem.prior.names]
     if a.settings.what_if == "added":
         rows = counted(sum(shift.settled for shift in a.what_if), "row")

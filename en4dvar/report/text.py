@@ -261,6 +261,6 @@ def math_pieces(body: str) -> list[tuple[str, str]]:
     """
     body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
-    body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], f"{m[1]} "), body)
+    body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], f"{m[1]} "), body).rstrip()
     pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
-    return [(mark, (index or base).strip("{} ")) for mark, index, base in pieces]
+    return [(mark, index.strip("{} ") or base.strip("{}")) for mark, index, base in pieces]

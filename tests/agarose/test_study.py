@@ -85,6 +85,7 @@ def test_synthetic_is_said_wherever_numbers_appear(small):
             assert "synthetic twin" in (out / f"table{number}.{suffix}").read_text().lower()
     page = (out / "study.html").read_text()
     assert page.count("ynthetic twin") > 40  # notice, every finding, table and caption
+    assert "then 1 round of refinement" in page
     for caption in page.split("<figcaption>")[1:]:
         assert "Synthetic twin" in caption.partition("</figcaption>")[0]
     assert "http" not in page.replace("http-equiv", "")

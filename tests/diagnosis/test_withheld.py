@@ -17,6 +17,7 @@ from en4dvar.data.noise import Kernel, Predicted, noise_of
 from en4dvar.diagnosis.analysis import BEYOND_5
 from en4dvar.diagnosis.withheld import chance_of, predict_withheld
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.summary import remarks
 from en4dvar.executor import SerialExecutor
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -189,6 +190,19 @@ def test_written_read_back_and_shown(tmp_path):
     assert np.mean([int(row["inside"]) for row in rows]) == a.withheld.inside
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{a.withheld.inside * 7:.0f} of 7 readings after the window" in page
+
+
+def test_one_reading_after_the_window_is_told_in_the_singular(tmp_path, monkeypatch):
+    """It read "100 % of 1 readings lie in their 90 % bands"."""
+    monkeypatch.setitem(globals(), "LATER", LATER[:1])
+    a = assimilate(continued(make_problem(Vectorised(), (1.0, 0.5)), (1.0, 0.5), 2), SETTINGS, 1)
+    for off, where in ((0.0, "in"), (9.0, "outside of")):
+        one = replace(a, withheld=replace(a.withheld, values=a.withheld.median + off))
+        assert f"after the window: the only reading lies {where} its 90 % band" in remarks(one)
+        Result.from_analysis(one, {}).save(tmp_path / "posterior.nc")
+        page = write_pages(tmp_path).read_text(encoding="utf-8")
+        assert f"The only reading after the window lies {where} the 90 % band of the prediction" in page
+        assert "(root mean square)." not in page
 
 
 def test_a_window_of_a_file_leaves_readings_and_a_rerun_predicts_them_again(tmp_path: Path, monkeypatch):

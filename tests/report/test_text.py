@@ -74,6 +74,7 @@ def test_no_minus_stands_before_a_rounded_zero():
         (r"$R_\mathrm{<script>}$", "<i>R</i><sub>&lt;script&gt;</sub>"),
         (r"$\dot R^2$", "<i>dot R</i><sup>2</sup>"),
         (r"$\ln u$", "<i>ln u</i>"),
+        (r"$t/t_{\max} + 1$", "<i>t/t</i><sub>max</sub><i> + 1</i>"),
     ],
 )
 def test_symbols_as_html(symbol, html):
