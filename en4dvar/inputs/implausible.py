@@ -73,7 +73,8 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
     Of the eight nearest those six speak that lie best on a parabola, for two of them may be wild as well (least trimmed
     squares: Rousseeuw 1984, J. Am. Stat. Assoc. 79, 871; all parabolas through three are tried). Below half of the
     largest reading, where a bubble collapses and rebounds, a reading has to be farther off than these six differ. One
-    below neighbours that fall towards it from both sides is the bottom of a collapse. At the ends a reading is odd if
+    below neighbours that fall towards it from both sides is the bottom of a collapse; one above all of these, by
+    a quarter, is no part of it, however steep it is. At the ends a reading is odd if
     it is above all of them: glare of a laser. Wild readings make the scatter seem larger than it is, so that without
     those that were found it is asked again.
     """
@@ -83,6 +84,8 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
     near = np.clip(own - NEAR // 2, 0, len(values) - NEAR - 1)[:, None] + np.arange(NEAR)
     near += near >= own[:, None]
     t, r, least = times[near] - times[:, None], values[near], np.full(len(values), np.inf)
+    valley = (near[:, 3] < own) & (own < near[:, 4]) & (r[:, 3] < r[:, 2]) & (r[:, 4] < r[:, 5])
+    odd |= valley & (values - r.max(axis=1) > np.maximum(OUTLYING * scatter, 0.25 * r.max(axis=1)))
     best = np.tile(np.arange(AGREEING), (len(values), 1))
     for a, b, c in itertools.combinations(range(NEAR), 3):
         with np.errstate(all="ignore"):  # of bounds at one time
@@ -283,6 +286,7 @@ def check_order(
     elif _several(times, ends):
         before, after = ends[0], ends[0] + 1
         hint = f"these look like {len(ends) + 1} series one after another: {apart}"
+        hint += "; where one clock began anew, add to its times"
     elif times[after] != times[before]:
         hint = "correct it, or sort the rows (data.unsorted: sort)"
     elif _differ(times, values):

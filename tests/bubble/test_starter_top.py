@@ -228,3 +228,12 @@ def test_a_bubble_that_creeps_back_has_a_top_and_is_no_driven_one(mu: float, gro
     assert np.isnan(seen.rebound)
     assert abs(seen.top.time) < 3 * seen.top.time_std
     assert seen.top.height == pytest.approx(largest, abs=3 * seen.top.height_std)
+
+
+def test_a_reading_above_a_collapse_is_far_from_its_neighbours() -> None:
+    """They fall too fast for a parabola, but towards it from both sides; its R_eq was half of the true one."""
+    radius = np.array([350.0, 340, 320, 290, 250, 184, 164, 142, 112, 266, 36, 63, 76, 81, 86, 90, 91, 94, 91])
+    (at,) = np.flatnonzero(outlying(np.arange(19.0), radius, 1.7))
+    assert radius[at] == 266
+    radius[at] = 75
+    assert not outlying(np.arange(19.0), radius, 1.7).any()

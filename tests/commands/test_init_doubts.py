@@ -269,7 +269,16 @@ def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
     done = call("init", "--data", "b.mat", *UNITS)
     assert "b.mat: R is an array of 3 x 9; its columns are R(:,1), R(:,2), …, its rows R(1,:), …\n" in done.stderr
-    assert "R(:,9); units are never guessed: add --radius-column R(:,*)" in done.stderr
+    assert "R(:,9); units are never guessed: add --radius-column 'R(:,*)'" in done.stderr
+
+
+def test_bubbles_side_by_side_are_named_by_a_pattern() -> None:
+    """The answer can be typed: a name with a blank is quoted. Columns that are no bubbles of one kind have none."""
+    rows = "\n".join(f"{t},1,2,3" for t in range(9))
+    for names, told in (("bubble A,bubble B,bubble C", "'bubble *'"), ("X,Area,Perimeter", "NAME"), ("X,Y,Z", "NAME")):
+        Path("b.csv").write_text(f"t,{names}\n{rows}\n")
+        done = call("init", "--data", "b.csv", "--time-column", "t", *UNITS)
+        assert f"units are never guessed: add --radius-column {told}" in done.stderr
 
 
 @pytest.mark.parametrize(

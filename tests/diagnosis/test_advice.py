@@ -32,12 +32,12 @@ from toys import Vectorised, Wave, make_observations, make_problem, with_discrep
 import en4dvar
 from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.honesty.advice import ADVICE, Case
+from en4dvar.diagnosis.honesty.advice import ADVICE, Case, advised
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative, ValidityLimit
 from en4dvar.model.state import Field, Parameter
-from en4dvar.plumbing.caution import CATALOGUE, Caution
+from en4dvar.plumbing.caution import CATALOGUE, Caution, caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import StateChanges
 from en4dvar.problem import InverseProblem
@@ -366,6 +366,18 @@ def test_errors_of_the_times_are_told_from_what_the_model_misses(seeds):
 @pytest.mark.parametrize("seeds", [range(2), range(2, 8)])
 def test_no_errors_of_the_times_are_seen_in_what_the_model_misses(kind, seeds):
     assert [run(late(kind, seed)).timing for seed in seeds] == [0.0] * len(seeds)
+
+
+@pytest.mark.parametrize(("stated", "first"), [(0.0, "how uncertain the times are with"), (1e-3, "a larger")])
+def test_readings_that_were_smoothed_are_thought_of(stated, first):
+    """A mean over five frames errs like one reading whose instant has the std of five instants about their middle."""
+    a = run(make_problem(Wave(), (1.0, 2.0), k=50, std=0.02, time_std=stated))
+    fast = caution("odd-residuals", "the residuals are larger where the observable changes fast")
+    (it,) = advised(replace(a, timing=0.0), [fast])
+    assert it.advice.startswith(
+        f"state {first} data.error.time_std (140 % of step where a reading is the mean of five)"
+    )
+    np.testing.assert_allclose(np.std(np.arange(5)), 1.4, rtol=0.02)
 
 
 def test_a_wrong_reading_is_no_error_of_the_times():

@@ -254,6 +254,9 @@ def _missed(case: Case) -> str:
     )
 
 
+MEANS = " (140 % of step where a reading is the mean of five)"  # √((n² − 1)/12) steps
+
+
 def _odd(case: Case) -> str:
     single = case.caution.words.startswith("the reading")
     if case.timing:
@@ -262,9 +265,9 @@ def _odd(case: Case) -> str:
         if case.absurd:
             return _structure(case)
         noise = case.a.observations.noise
-        first = "a larger" if noise.time_std.any() else "state how uncertain the times are with"
+        first = "state a larger" if noise.time_std.any() else "state how uncertain the times are with"
         other = _structure(case) if noise.discrepant else "the model errs where the observable changes fast"
-        return other if case.exact else f"{first} data.error.time_std; if the times are right, {other}"
+        return other if case.exact else f"{first} data.error.time_std{MEANS}; if the times are right, {other}"
     if case.may_be_robust:
         option = case.with_scheme("data.error.robust: huber")
         return f"look at this reading; with {option} such readings count less{case.or_times}"

@@ -105,7 +105,8 @@ def structure(analysis: Analysis) -> Findings:
     if residuals.collapse_chance < ODD:
         words = (
             "the residuals are larger where the observable changes fast (probability "
-            f"{_chance(residuals.collapse_chance)} if the errors are as stated): the times or the model are wrong there"
+            f"{_chance(residuals.collapse_chance)} if the errors are as stated): the times or the model are wrong "
+            "there, or the readings are means over several"
         )
         yield caution("odd-residuals", words)
     robust = math.isfinite(analysis.observations.noise.counts_within)

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -178,7 +179,8 @@ class Asked:
         if self.radius_column is None:
             others = [name for name in self.contents.columns if name != self.time_column]
             alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
-            missing.append(("--radius-column", alike or "NAME", "each of these columns is a bubble" if alike else ""))
+            which = (shlex.quote(alike), "each of these columns is a bubble") if alike else ("NAME", "")
+            missing.append(("--radius-column", *which))
         size = _only(_SIZE, self.contents.scalars)
         radii = self.radius_column or ""
         halved = bool(DIAMETER.match(radii))
@@ -256,6 +258,10 @@ def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
 
 
 def _numbered(names: Sequence[str]) -> str:
-    """The pattern with ``*`` of names that differ by a number only, as ``R_1``, ``R_2``, …; "" where they do not."""
-    patterns = {re.sub(r"\d+", "*", name, count=1) for name in names}
-    return patterns.pop() if len(patterns) == 1 < len(names) else ""
+    """The pattern with ``*`` of names that differ by a number only, as ``R_1``, ``R_2``, …, or by a capital letter, as
+    ``bubble A``, ``bubble B``, …; "" where they do not."""
+    for what in (r"\d+", r"(?<![^\W_])[A-Z](?![^\W_])"):
+        patterns = {re.sub(what, "*", name, count=1) for name in names}
+        if len(patterns) == 1 < len(names) and patterns != {"*"}:
+            return patterns.pop()
+    return ""
