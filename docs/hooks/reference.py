@@ -11,6 +11,7 @@ from mkdocs.structure.files import File, Files
 
 log = logging.getLogger("mkdocs.hooks.reference")
 Json = dict[str, Any]
+WIDTH = 84  # characters of a block beside the navigation, on a screen of 1280 pixels
 
 
 def on_files(files: Files, config: Any, **_: Any) -> Files:
@@ -79,7 +80,7 @@ def _key(path: str, node: Json, parent: Json, definitions: Json) -> list[list[st
     """The row of one key and those of the keys below it."""
     name = path.rpartition(".")[2]
     required = name in parent.get("required", [])
-    default = "" if node.get("default") in (None, [], {}) else f"`{_text(node['default'])}`"
+    default = "" if node.get("default") in (None, "", [], {}) else f"`{_text(node['default'])}`"
     if not node.get("description"):
         log.warning("YAML key %s has no description", path)
     shown = f"**`{path}`**" if required else f"`{path}`"
@@ -167,8 +168,7 @@ def command_page() -> str:
     """Every command as ``--help`` tells it."""
     from en4dvar.cli import main
 
-    width = {"max_content_width": 100, "terminal_width": 100}
-    context = click.Context(main, info_name="en4dvar", **width)
+    context = click.Context(main, info_name="en4dvar")
     parts = [
         "# Command line",
         "Generated from `--help`. Errors are told as `file:line:column: key: message`, all at once.",
@@ -186,9 +186,8 @@ def command_page() -> str:
     for name in main.list_commands(context):
         command = main.get_command(context, name)
         assert command is not None
-        inner = click.Context(
-            _loaded(command), info_name=name, parent=context, max_content_width=100, terminal_width=100
-        )
+        width = {"max_content_width": WIDTH, "terminal_width": WIDTH}
+        inner = click.Context(_loaded(command), info_name=name, parent=context, **width)
         parts += [f"## {name}", f"```text\n{inner.command.get_help(inner)}\n```"]
     return "\n\n".join(parts) + "\n"
 

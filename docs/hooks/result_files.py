@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 SHOWN = {
@@ -16,8 +17,13 @@ HIDDEN = {"chain", "draw", "quantile"}  # coordinates that need no words
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """The page with the tables."""
-    return with_tables(markdown)
+    """The page with the tables, whose names are broken at "_", if anywhere."""
+    tables = partial(re.sub, r"`([^`]*_[^`]*)`", _breakable)
+    return re.sub(r"<!-- \w+ -->", lambda m: tables(with_tables(m[0])), markdown)
+
+
+def _breakable(name: re.Match[str]) -> str:
+    return f"<code>{name[1].replace('_', '_<wbr>')}</code>"
 
 
 def with_tables(markdown: str) -> str:
