@@ -286,7 +286,7 @@ def check_order(
     elif _several(times, ends):
         before, after = ends[0], ends[0] + 1
         hint = f"these look like {len(ends) + 1} series one after another: {apart}"
-        hint += "; where one clock began anew, add to its times"
+        hint += "; of one series whose clock began anew, add the time that had passed to the later times"
     elif times[after] != times[before]:
         hint = "correct it, or sort the rows (data.unsorted: sort)"
     elif _differ(times, values):

@@ -445,7 +445,7 @@ def _workbook(path: Path) -> Path:
         (
             "0,9 1,8 2,7 3,6 0,9 1,7 2,5 3,3",
             "a column that says whose each row is, and name it by --by",
-            "name it by --by",
+            "of one series whose clock began anew, add the time that had passed to the later times",
         ),
     ],
 )
@@ -488,7 +488,7 @@ def test_columns_that_differ_by_a_number_are_proposed_as_bubbles(tmp_path: Path)
     wide = "\n".join(["t_us,R_1,R_2", *(f"{line},{line.split(',')[1]}" for line in lines), ""])
     Path("b.csv").write_text(wide)
     done = call("init", "--data", "b.csv", *UNITS)
-    assert "add --radius-column R_* (each of these columns is a bubble)" in done.stderr
+    assert "add --radius-column 'R_*' (each of these columns is a bubble)" in done.stderr
     assert done.stderr.splitlines()[-1].endswith("--radius-column 'R_*'")
     done = call("init", "--data", "b.csv", *UNITS, "--radius-column", "R_*")
     assert done.exit_code == 0, done.output

@@ -32,7 +32,9 @@ def advice(path: Path, head: str, rows: list[tuple[object, ...]], unsorted: Diso
 def test_a_clock_that_begins_anew_is_one_way_to_look_like_several_series(tmp_path: Path) -> None:
     """As where a camera counts the frames of each burst from 0: the second half is no other bubble."""
     rows = [(t if t < 10 else t - 10, r) for t, r in ONE]
-    assert "where one clock began anew, add to its times" in advice(tmp_path / "t.csv", "t,R", rows, "refuse")
+    assert "of one series whose clock began anew, add the time that had passed to the later times" in advice(
+        tmp_path / "t.csv", "t,R", rows, "refuse"
+    )
 
 
 @pytest.mark.parametrize("unsorted", ["refuse", "sort"])

@@ -179,7 +179,7 @@ class Asked:
         if self.radius_column is None:
             others = [name for name in self.contents.columns if name != self.time_column]
             alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
-            which = (shlex.quote(alike), "each of these columns is a bubble") if alike else ("NAME", "")
+            which = (alike, "each of these columns is a bubble") if alike else ("NAME", "")
             missing.append(("--radius-column", *which))
         size = _only(_SIZE, self.contents.scalars)
         radii = self.radius_column or ""
@@ -202,7 +202,8 @@ class Asked:
 
     def incomplete(self, file: Path, advice: str) -> ConfigError:
         """The error that names what is :meth:`needed`."""
-        options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in self.needed())
+        needed = ((f"{option} {shlex.quote(value)}", hint) for option, value, hint in self.needed())
+        options = ", ".join(f"{words}{f' ({hint})' if hint else ''}" for words, hint in needed)
         spoilt = [self.contents.others[name] for name in self._spoilt()]
         if spoilt:
             return ConfigError("\n".join(spoilt))
