@@ -32,9 +32,8 @@ def advice(path: Path, head: str, rows: list[tuple[object, ...]], unsorted: Diso
 def test_a_clock_that_begins_anew_is_one_way_to_look_like_several_series(tmp_path: Path) -> None:
     """As where a camera counts the frames of each burst from 0: the second half is no other bubble."""
     rows = [(t if t < 10 else t - 10, r) for t, r in ONE]
-    assert "of one series whose clock began anew, add the time that had passed to the later times" in advice(
-        tmp_path / "t.csv", "t,R", rows, "refuse"
-    )
+    told = advice(tmp_path / "t.csv", "t,R", rows, "refuse")
+    assert "of one series whose clock began anew, add the time that had passed to the later times" in told
 
 
 @pytest.mark.parametrize("unsorted", ["refuse", "sort"])
@@ -72,7 +71,7 @@ def test_one_series_is_sorted(tmp_path: Path, rows: list[tuple[object, ...]]) ->
 
 def test_of_vectors_no_column_is_asked_for(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"t": np.tile(T, 2), "R": np.concatenate([A, B])})
-    with pytest.raises(DataError, match=r"sample 21: .*: give each a file of its own; where one [a-z ,]*$"):
+    with pytest.raises(DataError, match=r"sample 21: .*: give each a file of its own; of one series [a-z ,]*$"):
         read_series(tmp_path / "a.mat", TIME, RADIUS)
 
 
