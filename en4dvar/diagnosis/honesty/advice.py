@@ -254,7 +254,7 @@ def _missed(case: Case) -> str:
     )
 
 
-MEANS = " (140 % of step where a reading is the mean of five)"  # √((n² − 1)/12) steps
+MEANS = " (140 % of step where a reading is the mean of five)"  # n instants have the std √((n² − 1)/12) steps
 
 
 def _odd(case: Case) -> str:
