@@ -127,7 +127,8 @@ def remarks(a: Analysis) -> tuple[str, ...]:
 
 def _narrowed(of: FieldEstimate) -> str:
     field, stds = of.prior.field, (math.sqrt(np.mean(std**2)) for std in (of.prior_std, of.std))
-    before, after = (f"{std:.3g} {field.unit}".removesuffix(" 1") for std in stds)
+    shown = (convert(std, field.unit, field.display_unit) for std in stds)
+    before, after = (f"{std:.3g} {field.display_unit}".removesuffix(" 1") for std in shown)
     words = f"standard deviation {after} after the readings, {before} before them (root mean square)"
     return f"{field.name} of {counted(field.size, 'cell')}: {words}; see the report"
 

@@ -73,9 +73,9 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
     Of the eight nearest those six speak that lie best on a parabola, for two of them may be wild as well (least trimmed
     squares: Rousseeuw 1984, J. Am. Stat. Assoc. 79, 871; all parabolas through three are tried). Below half of the
     largest reading, where a bubble collapses and rebounds, a reading has to be farther off than these six differ. One
-    below neighbours that fall towards it from both sides is the bottom of a collapse; one above all of these, by
-    a quarter, is no part of it, however steep it is. At the ends a reading is odd if
-    it is above all of them: glare of a laser. Wild readings make the scatter seem larger than it is, so that without
+    below neighbours that fall towards it from both sides is the bottom of a collapse; one that is higher than all of
+    them, by a quarter, is no part of it, however steep it is. At the ends a reading is odd if it is above all of its
+    neighbours: glare of a laser. Wild readings make the scatter seem larger than it is, so that without
     those that were found it is asked again.
     """
     odd, own = np.zeros(len(values), dtype=bool), np.arange(len(values))

@@ -172,7 +172,7 @@ def log_ratio(of_first: Array, of_second: Array) -> float:
     while abs(change) > STILL:
         at_first, at_second = (np.logaddexp(first, second + of - log) for of in (of_first, of_second))
         change = np.logaddexp.reduce(of_first - log - at_first) - np.logaddexp.reduce(-at_second) - first + second
-        log += change
+        log += 0.5 * change  # which falls by up to 2 for each 1 of log: whole steps may go to and fro
     return float(log)
 
 

@@ -30,7 +30,7 @@ class Importance:
     """The draws of one data set from its proposals, ``count`` in a round, the first of them from ``first``.
 
     ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
-    of draws behind it. ``settled``: whether rounds that trained the proposal had stopped to reach farther.
+    of draws behind it. ``settled``: whether the rounds that trained the proposal had ceased to reach farther.
     """
 
     def __init__(self, first: Proposal, stream: np.random.Generator, count: int):

@@ -54,7 +54,7 @@ CLEARED = 0.85  # effective share of the members above which no run was found th
 LogDensity = Callable[[Array], Array]
 Points = tuple[Array, Array, LogDensity]
 """(B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
-STILL_REACHING = "every round of draws reached farther along the posterior than that before: its ends may be missing"
+STILL_REACHING = "each round of draws reached farther along the posterior than the one before: its ends may be missing"
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 

@@ -155,9 +155,10 @@ def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, 
 
 
 def narrowed(run: SequentialState, start: InitialEnsemble, settings: SequentialSettings, times: int) -> Iterator[str]:
-    """Where perturbed observations make constants too sure: that bystanders are moved and narrowed is chance alone.
+    """Where perturbed observations make constants too sure: what moves and narrows bystanders is chance alone.
 
-    A share d of the variance P a cycle, e² ← e² + d P and P ← (1 − d) λ² P: inflation λ = exp(¾ d) keeps e² below 2 P.
+    In each cycle chance takes a share d of the variance P and adds as much to the squared error e²: e² ← e² + d P and
+    P ← (1 − d) λ² P. An inflation λ = exp(¾ d) lets P grow by d/2 a cycle, which keeps e² below 2 P.
     """
     error, layout, by = settings.model_error, start.model.layout, run.bystanders
     names = [name for name in (start.prior.names if start.prior else ()) if name in layout.names]

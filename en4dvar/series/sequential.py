@@ -36,7 +36,7 @@ from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, Member
 
 R = TypeVar("R")
 REFLECTIONS = 4  # of a rotation
-BYSTANDERS = 16
+BYSTANDERS = 16  # constants beside the state that nothing depends on
 BLOCK = 64  # rotations drawn together; part of the random numbers' definition
 
 

@@ -76,7 +76,7 @@ def numbers(text: str, option: str, names: str) -> tuple[float, ...]:
 def watched(movie: Movie, region: str | None, mask: Path | None) -> Mask | None:
     """The part of a frame (H, W) that is looked at; None: all of it.
 
-    Raises DataError: the region lies outside the frame, the mask is no picture of its size, or hardly a pixel is left.
+    Raises DataError: the region lies outside the frame, the mask is no picture of its size, or they leave too little.
     """
     if region is None and mask is None:
         return None
@@ -94,6 +94,6 @@ def watched(movie: Movie, region: str | None, mask: Path | None) -> Mask | None:
         if light.shape[:2] != part.shape:
             raise DataError(f"{mask}: {light.shape[1]} × {light.shape[0]} pixels, the frames have {width} × {height}")
         part &= (light[..., :3].max(axis=2) if light.ndim == 3 else light) > 0
-    if min(part.any(axis=0).sum(), part.any(axis=1).sum()) < 3:  # of a quadratic surface
+    if min(part.any(axis=0).sum(), part.any(axis=1).sum()) < 3:  # a quadratic surface needs three
         raise DataError("--region and --mask leave nothing of the frame that a bubble is seen in")
     return part

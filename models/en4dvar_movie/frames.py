@@ -29,8 +29,9 @@ IMAGES = (".png", ".bmp", ".jpg", ".jpeg")
 LEAST_SIDE = 16
 PLAYED = 30  # frames a second, of a video that is written
 MOVIES = Allowed(seconds=20, memory=2_000_000_000, size=256_000_000_000)
-COUNTED = 20  # pixels to a level that tell the next
-PULLED, FLAT = 3.0, 0.05  # steps of rare levels between common ones, and off an even histogram, of one made even
+COUNTED = 20  # pixels to each grey level, from which on a frame tells how far apart its levels are
+PULLED = 3.0  # steps between common levels over those between rare ones, where a histogram was equalised
+FLAT = 0.05  # the largest difference of its cumulative histogram from an even one
 MOSAIC = 0.03  # of the mean of four pixels: by which those of a mosaic differ, beside their scatter
 COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
 
@@ -113,10 +114,11 @@ def saturated(frames: Iterable[Frame]) -> float:
 
 
 def steps_of(frames: Sequence[Frame]) -> tuple[float, bool]:
-    """From the brightness of most pixels to the next one that a frame holds, in the median over frames of integers; and
-    whether a histogram was equalised: that is further than between the rarest, or of all brightness there is as much.
+    """The step to the next lower grey level at half of the pixels or more, in the median over frames of integers; and
+    whether histograms were equalised: that step is far larger than those between rare levels, or all levels are as
+    common.
     """
-    steps, even = [0.0], [False]
+    steps, even = list[float](), list[bool]()
     for frame in frames:
         values, counts = np.unique(frame if frame.dtype.kind in "ui" else 0, return_counts=True)
         if len(values) > 1 and frame.size > COUNTED * len(values):
@@ -124,8 +126,8 @@ def steps_of(frames: Sequence[Frame]) -> tuple[float, bool]:
             order = np.argsort(gaps)
             steps.append(float(gaps[order][np.searchsorted(np.cumsum(counts[order]), frame.size / 2)]))
             off = np.max(np.abs(np.cumsum(counts) / frame.size - values / values[-1]))
-            even.append(steps[-1] >= PULLED * np.percentile(gaps, 10) or off < FLAT)
-    return float(np.median(steps)), bool(np.median(even))
+            even.append(bool(steps[-1] >= PULLED * np.percentile(gaps, 10) or off < FLAT))
+    return float(np.median(steps or [0.0])), 2 * sum(even) > len(even)
 
 
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:

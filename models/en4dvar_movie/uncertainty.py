@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Array, Indices
-from en4dvar.plumbing.hints import percent
+from en4dvar.plumbing.hints import counted, percent
 from en4dvar_movie.frames import Frame, steps_of
 from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
@@ -51,8 +51,9 @@ LIKELY = 2.0  # std of noise beyond which a frame is blurred by motion rather th
 CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 CUT = 3.0  # amplitudes of mode 2, by the share unseen: circles about cut ellipses are off by 1 to 4
-ASKED, CLIPPED, HALF = 8, 0.25, 0.5  # frames; the share saturated beside an edge that hides its place; by pixels
-COARSE = 3.0  # std of noise beyond which steps of grey levels are not smoothed by it
+ASKED = 8  # frames whose grey levels are counted
+CLIPPED, HALF = 0.25, 0.5  # the share saturated beside an edge that hides its place; pixels that it then may be off
+COARSE = 3.0  # std of noise: steps of grey levels that are larger are not smoothed by it
 RIM = 0.5  # of its level at the edge: what is not known of a rim's shape
 
 
@@ -86,7 +87,8 @@ def with_hidden(optics: Optics, frames: Sequence[Frame], clipped: float, grey: f
         hidden, words = 2 * hidden, "a program has equalised the histogram of the frames"
     elif share > 2 * THRESHOLD and step > COARSE * optics.noise * grey:
         hidden *= min(1.0, (2 * np.pi) ** 0.5 * share)
-        words = f"the frames have few grey levels, {max(1 / share, 1):.0f} steps from the bubble to the light about it"
+        steps = counted(max(round(1 / share), 1), "step")
+        words = f"the frames have few grey levels, {steps} from the bubble to the light about it"
     return replace(optics, hidden=hidden, hides=words) if words else optics
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner, Result
-from field_models import write_line
+from field_models import Line, write_line
 from toy_config import YAML, csv_text, write_toy
 
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell, _Warnings
 from en4dvar.config import load_config
 from en4dvar.estimation.summary import ParameterSummary, brief
+from en4dvar.model.state import StateLayout
 from en4dvar.plumbing.caution import caution
 from en4dvar.report.figures import FIGURES
 from en4dvar.report.result import load_result
@@ -364,13 +366,15 @@ def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
     assert "the population: few draws" in "\n".join(alone.lines())
 
 
-def test_a_run_of_a_field_alone_tells_how_far_it_is_narrowed(tmp_path: Path) -> None:
-    """The head of a table without rows was all that the terminal showed."""
+def test_a_run_of_a_field_alone_tells_how_far_it_is_narrowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The head of a table without rows was all that the terminal showed. Units are those of the page."""
+    u, offset = Line.layout.fields
+    monkeypatch.setattr(Line, "layout", StateLayout((replace(u, display_unit="mK"), offset)))
     done = call("run", write_line(tmp_path), "--out", tmp_path / "run", "--no-report")
-    told = re.fullmatch(r"line: (u of 30 cells: standard deviation (\S+) K after the readings, .*)\n", done.stdout)
+    told = re.fullmatch(r"line: (u of 30 cells: standard deviation (\S+) mK after the readings, .*)\n", done.stdout)
     assert told, done.output
     stds = load_result(tmp_path / "run" / "posterior.nc").dataset("fields")["u_std"].values
-    assert float(told[2]) == pytest.approx(np.sqrt(np.mean(stds**2)), rel=0.01)
+    assert float(told[2]) == pytest.approx(1e3 * np.sqrt(np.mean(stds**2)), rel=0.01)
     assert f"line: estimate: {told[1]}\n" in (tmp_path / "run" / "run.log").read_text(encoding="utf-8")
 
 

@@ -46,6 +46,13 @@ def test_a_file_of_several_shots_is_proposed_for_the_first_and_said_to_be_one(tm
     assert [words in it for it in told.values()] == [False, True]
     one, shots = (build(load_config(f"{name}.yaml"))[0] for name in told)
     assert len(shots.observations) == len(one.observations)
+    assert "this is a proposal for the one before" in told["shots"]
+    Path("folder").mkdir()
+    for name in told:
+        Path(f"{name}.csv").rename(f"folder/{name}.csv")
+    of_folder = call("init", "--data", "folder", *UNITS).stderr  # its window reaches to the end of each file
+    assert words in of_folder
+    assert "proposal for the one before" not in of_folder
 
 
 def test_a_driven_bubble_whose_times_are_in_another_unit_is_noticed() -> None:

@@ -182,7 +182,9 @@ class Canal(ForwardModel):
     """Heads along a soil that carries rain to both ends, by its ln T: each tells of all cells."""
 
     parameters = ()
-    layout = StateLayout(tuple(Field(name, 60, coordinates=np.arange(60.0)) for name in ("ln_T", "head")))
+    layout = StateLayout(
+        tuple(Field(name, 60, coordinates=np.arange(60.0), coordinate_unit="m") for name in ("ln_T", "head"))
+    )
     observables = (Observable("head", "1", StateField("head")),)
     time_unit = "1"
 
@@ -208,13 +210,13 @@ def test_readings_that_are_not_local_are_advised_less_localisation():
     def estimated(**keys):
         return en4dvar.estimate(
             model, {"head": read}, {}, error={"head": std}, series={"head": {"places": cells}},
-            initial_state={"ln_T": {"std": 1, "kernel": "gaussian", "length": 8}},
+            initial_state={"ln_T": {"std": 1, "kernel": "gaussian", "length": "8 m"}},
             assimilation={"members": 40, **keys},
         )  # fmt: skip
 
-    advice = {c.code: c.advice for c in estimated(localisation={"radius": 8}).cautions}
+    advice = {c.code: c.advice for c in estimated(localisation={"radius": "8 m"}).cautions}
     assert advice["misfit"].startswith("settle the warning not-converged first")
-    assert "larger assimilation.localisation.radius (it is 8), or leave localisation out" in advice["not-converged"]
+    assert "larger assimilation.localisation.radius (it is 8 m), or leave localisation out" in advice["not-converged"]
     whole = estimated()
     assert not {"misfit", "not-converged"} & {c.code for c in whole.cautions}
     assert np.sqrt(np.mean((whole.dataset("fields")["ln_T_mean"].values - truth) ** 2)) < 0.3

@@ -69,6 +69,13 @@ def test_grey_levels_that_tell_little_of_the_light_are_told(name):
     assert bool(words) == (optics.hidden > 0.3)
 
 
+def test_a_single_step_of_grey_levels_is_told_in_the_singular():
+    dark = np.hypot(*(np.indices(SHAPE) - 48)) < 30
+    shown = [np.where(dark, 0, 128).astype(np.uint8)]
+    told = with_hidden(Optics(-0.75, 0.6, noise=0.01), shown, 0.0, 160.0).hides
+    assert told.endswith("few grey levels, 1 step from the bubble to the light about it")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["4 levels", "8 levels", "equalised", "by roots"])
 def test_the_common_error_holds_what_few_grey_levels_do(name):

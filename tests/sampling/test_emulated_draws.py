@@ -236,6 +236,11 @@ def test_the_integral_of_a_density_beyond_the_draws_of_another_is_known():
     assert off == pytest.approx(np.zeros(6), abs=0.1)
 
 
+def test_the_integral_of_a_density_that_no_draw_of_another_reaches_ends():
+    """Whole steps went to and fro for ever."""
+    assert -30 < log_ratio(np.full(15000, -30.0), np.full(600, 30.0)) < 30
+
+
 def test_where_the_model_cannot_be_run_nothing_is_drawn():
     valley = Valley(lost=lambda z: z[:, 0] > 0.3)
     draws = sample_modes(valley.recorded, valley.prior, [valley.about], 1, 400.0)

@@ -16,7 +16,7 @@ from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.report.sequence import ranks
-from en4dvar.schemes.filters import ETKF
+from en4dvar.schemes.filters import ETKF, EnKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
@@ -254,6 +254,14 @@ EXPECTED = {  # config: (cycles, burn-in, upper bound of the analysis RMSE, lowe
     "lorenz96_letkf": (250, 100, 0.26, 0.16),
     "lorenz96_parameter": (300, 150, 0.24, 0.15),
 }
+
+
+def test_a_constant_that_perturbed_observations_make_too_sure_is_told():
+    term = PriorTerm.normal(Lorenz63.parameters[1], 28, 1)
+    made = replace(lorenz63(EnKF(), 200, members=12, inflation=1.0), prior=Prior((term,)))
+    fixed = {name: value for name, value in made.fixed.items() if name != term.parameter.name}
+    told = conduct(replace(made, fixed=fixed), 1).warnings
+    assert any(words.startswith("perturbed observations move and narrow rho by chance") for words in told)
 
 
 def test_every_twin_configuration_is_run():

@@ -96,8 +96,9 @@ class Case:
         local = self.a.settings.localisation
         if local is None or local.radius is None:
             return ""
-        larger = f"a larger assimilation.localisation.radius (it is {local.radius:g})"
-        return f"compare with {larger}, or leave localisation out"
+        unit = next((estimate.prior.field.coordinate_unit for estimate in self.a.fields), "1")
+        now = f"{local.radius:g} {unit}".removesuffix(" 1")
+        return f"compare with a larger assimilation.localisation.radius (it is {now}), or leave localisation out"
 
     @property
     def structure(self) -> str:
@@ -254,7 +255,7 @@ def _missed(case: Case) -> str:
     )
 
 
-MEANS = " (140 % of step where a reading is the mean of five)"  # √((n² − 1)/12) steps
+MEANS = " (140 % of step where a reading is the mean of five)"  # n instants have the std √((n² − 1)/12) steps
 
 
 def _odd(case: Case) -> str:

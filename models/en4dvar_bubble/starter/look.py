@@ -142,7 +142,7 @@ UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
 DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 STEADY = 0.6  # correlation of ln R with time in the last quarter of a history that falls to the end, also with ripples
 GAS = 0.6  # of R_max: a bubble at rest is smaller
-QUIET, SETTLES = 0.45, (3.0, 0.5)  # of R_max: the readings from 3 to 0.5 collapse times before another bubble lie below
+QUIET, SETTLES = 0.45, (3.0, 0.5)  # of R_max: below it lie the readings 3 to 0.5 collapse times before another bubble
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 SEVERAL = 4  # readings before a bubble, or at least of one
@@ -358,8 +358,8 @@ def _before_a_hole(times: Array, radius: Array) -> int:
 
 
 def _before_another(times: Array, radius: Array, peak: Lobe) -> int:
-    """How many readings precede another bubble, as of the next shot of a laser; all. What oscillates by itself does not
-    grow again when it was small for longer than a period."""
+    """How many readings precede another bubble, as of the next shot of a laser; all of them where none follows the
+    largest. What oscillates by itself does not grow again when it was small for longer than a period."""
     largest, (begun, ended) = float(radius.max()), SETTLES
     tall = (radius > GAS * largest) & (times > peak.t_max + (1 + begun) * peak.t_c)
     for first in np.flatnonzero(tall & ~np.append(False, tall[:-1])):
