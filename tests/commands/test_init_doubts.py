@@ -47,6 +47,11 @@ def test_a_file_of_several_shots_is_proposed_for_the_first_and_said_to_be_one(tm
     one, shots = (build(load_config(f"{name}.yaml"))[0] for name in told)
     assert len(shots.observations) == len(one.observations)
     assert "this is a proposal for the one before" in told["shots"]
+    smaller = [f"{t:.9g},{0.9 * r:.9g}" for t, r in cells]  # the larger one comes second
+    Path("second.csv").write_text("\n".join([head, *smaller, *[f"{t + 1e3:.9g},{r:.9g}" for t, r in cells], ""]))
+    of_second = call("init", "--data", "second.csv", *UNITS).stderr
+    assert f"{words}, larger than the one before" in of_second
+    assert "this is a proposal for the larger one" in of_second
     Path("folder").mkdir()
     for name in told:
         Path(f"{name}.csv").rename(f"folder/{name}.csv")

@@ -182,7 +182,8 @@ class Look:
     range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
     or has a ``hole`` there, told in words, so that the time of the collapse is where a fit goes on to. ``reason`` says
     in words why ``start`` is proposed, ``clear`` whether the data leave no doubt. ``another`` is the instant of the
-    last reading before another bubble, NaN where none follows; what is behind it does not count.
+    last reading before another bubble, NaN where none follows; what is behind it does not count. ``earlier`` is that
+    before this bubble where it follows another one, NaN where it does not.
     """
 
     begin: float
@@ -205,6 +206,7 @@ class Look:
     reason: str
     clear: bool
     another: float = float("nan")
+    earlier: float = float("nan")
 
     @property
     def resting(self) -> tuple[float, float, str]:
@@ -249,7 +251,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"the first {begins} readings are small beside the bubble, which appears at {when}: ultrasound makes it "
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
-    if chosen == "laser" and (count := _before_another(times, radius, peak)) < len(times):
+    shots = [*_shots(times, radius, peak)] if chosen == "laser" else []
+    for count in [count for count in shots if count > largest][:1]:
         return replace(look(times[:count], radius[:count], start), another=float(times[count - 1]))
     step, falls = float(np.median(np.diff(times))), bool(radius[largest:].min() < COLLAPSED * radius[largest])
     noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
@@ -261,7 +264,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, _trough(radius[largest:], rebound), rests,
         n_minima, prominence, falls, chosen == "laser" and not hole and (early or single(times, radius)), early,
-        hole, chosen, reason, clear,
+        hole, chosen, reason, clear, earlier=float(times[shots[-1] - 1]) if shots else math.nan,
     )  # fmt: skip
 
 
@@ -357,17 +360,16 @@ def _before_a_hole(times: Array, radius: Array) -> int:
     return len(times)
 
 
-def _before_another(times: Array, radius: Array, peak: Lobe) -> int:
-    """How many readings precede another bubble, as of the next shot of a laser; all of them where none follows the
-    largest. What oscillates by itself does not grow again when it was small for longer than a period."""
+def _shots(times: Array, radius: Array, peak: Lobe) -> Iterator[int]:
+    """How many readings precede each bubble that follows another one, as of the next shot of a laser. What oscillates
+    by itself does not grow again when it was small for longer than a period."""
     largest, (begun, ended) = float(radius.max()), SETTLES
-    tall = (radius > GAS * largest) & (times > peak.t_max + (1 + begun) * peak.t_c)
-    for first in np.flatnonzero(tall & ~np.append(False, tall[:-1])):
+    tall = radius > GAS * largest
+    shown = np.union1d(np.flatnonzero(tall[:-2] & tall[1:-1] & tall[2:]), np.argmax(radius))  # two may be wild
+    for first in shown[np.diff(times[shown], prepend=times[shown[:1]]) > (1 + begun) * peak.t_c]:
         start, stop = np.searchsorted(times, times[first] - np.array([begun, ended]) * peak.t_c)
-        quiet = radius[min(start, stop - 1) : stop].max()
-        if tall[first : first + 3].sum() == 3 and quiet < QUIET * largest:  # two may be wild
-            return int(np.flatnonzero(radius[:first] <= quiet)[-1]) + 1
-    return len(times)
+        if (quiet := radius[min(start, stop - 1) : stop].max()) < QUIET * largest:
+            yield int(np.flatnonzero(radius[:first] <= quiet)[-1]) + 1
 
 
 def _unseen(times: Array, radius: Array) -> float | None:

@@ -52,10 +52,9 @@ WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess 
 SAME_CLOCK = 2e-6  # s: of a guessed clock
 COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
 ANOTHER = (
-    "{}: behind {:.6g} us another bubble begins, about as large as the one before, which had come to rest: give each a "
-    "file of its own, or a column that says whose each row is, and name it by --by"
+    "{}: behind {:.6g} us another bubble begins, {} the one before, which had come to rest: give each a file of its "
+    "own, or a column that says whose each row is, and name it by --by{}"
 )
-BEFORE_IT = "; this is a proposal for the one before"
 EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
@@ -125,11 +124,13 @@ def propose(
         for name, view in looks.items()
         if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
-    warnings += [
-        ANOTHER.format(name, 1e6 * view.another) + BEFORE_IT * (len(views) == 1)  # a window of several is for all
-        for name, view in looks.items()
-        if np.isfinite(view.another)
-    ]
+    for name, view in looks.items():
+        for instant, size, which in (
+            (view.earlier, "larger than", "larger one"),
+            (view.another, "about as large as", "one before"),
+        ):
+            whose = f"; this is a proposal for the {which}" * (len(views) == 1)  # a window of several is for all
+            warnings += [ANOTHER.format(name, 1e6 * instant, size, whose)] * bool(np.isfinite(instant))
     wrong = "make G wrong by half" if "G" in {*others, *guess.values} else "move an estimate by several error bars"
     warnings += [elsewhere.PULSE.format(wrong)] * (chosen == "acoustic")
     doubted, believed = elsewhere.doubted(looks, model), guess
