@@ -305,10 +305,10 @@ def _window(look: Look, views: Sequence[Look]) -> Entry:
     words, until = "what happens before the top is not modelled", ""
     if look.drift and len(views) == 1:
         words, until = f"{words}; {look.drift}: no bubble after its last minimum", f", until: trough {look.n_minima}"
-    end = _end(views)
-    if np.isfinite(look.another) and len(views) == 1:
-        last = f"{1e6 * look.another:.9g} us"
-        end, until = end.replace("end", last), until or f", until: {last}"
+    end, last = _end(views), np.fmin.reduce([view.another for view in views])
+    if last > max(view.lobe.t_max + 2 * view.lobe.t_c for view in views):  # else clocks differ
+        text = f"{1e6 * last:.9g} us"
+        end, until = text if end == "end" else end, until or f", until: {text}"
     return Entry("window", f"{{from: top, to: {end}{until}{low}}}", words)
 
 
