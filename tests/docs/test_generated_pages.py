@@ -66,6 +66,17 @@ def test_the_page_names_nothing_that_is_not_there(result, page):
                 assert there[name] == set(re.findall(r"\w+", dims)), f"{group}: {name} has {there[name]}"
 
 
+def test_every_row_of_a_series_has_the_words_of_its_meaning_and_unit(page):
+    rows = {
+        row[0].strip("| "): row[1:]
+        for row in re.findall(r"^\|[^|]*\| (`\w+`) \|[^|]*\| ([^|]*) \| ([^|]*) \|", page, re.M)
+    }
+    assert rows["`analysis_mean`"] == ("its own: coordinate `units`", "mean of the analysis ensemble")
+    assert rows["`predicted_mean`"][0] == "its own: of a sequence coordinate `observation_units`"
+    assert (rows["`symbol`"][0], rows["`evidence`"][0]) == ("", "1")
+    assert not [row for row in page.splitlines() if "the its" in row]
+
+
 def test_the_example_reads_a_file(result, tmp_path, monkeypatch):
     (example,) = (b for b in blocks(PAGE) if b.language == "python")
     (tmp_path / "runs" / "quickstart").mkdir(parents=True)
