@@ -177,6 +177,14 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no std": ({"error": 0.0}, "error.y_std: must be positive, not 0.0"),
     "odd error": ({"error": {"y_std": 0.1, "y_sd": 1.0}}, "error.y_sd: unknown key 'y_sd'; did you mean 'y_std'?"),
     "errors": ({"error": np.ones(3)}, "error: y_std has 3 numbers for 12 readings"),
+    "errors of other times": (
+        {"data": pd.Series(VALUES, TIMES), "error": pd.Series(np.ones(12), TIMES + 1)},
+        "error: y_std has another index than the readings; align them",
+    ),
+    "errors of other rows": (
+        {"data": pd.DataFrame({"y": VALUES}, TIMES), "observable": ["y"], "error": {"y": pd.Series(np.ones(12))}},
+        "error: y: y_std has another index than the readings; align them",
+    ),
     "no error column": ({"error": {"y_std": {"column": "sd"}}}, "data: no column 'sd'; the columns are: time, y"),
     "prior": ({"priors": {"a": {"prior": "flat"}}}, "priors.a.prior: 'flat' is not one of"),
     "prior unit": (
