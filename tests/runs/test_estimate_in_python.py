@@ -362,3 +362,10 @@ def test_values_without_a_name_are_what_a_model_named_observes(section):
     named = en4dvar.estimate(section, (TIMES, VALUES), prior, error=0.1, progress=False)
     handed = en4dvar.estimate(Trend, (TIMES, VALUES), prior, error=0.1, progress=False)
     np.testing.assert_allclose(named.posterior["level"], handed.posterior["level"], rtol=1e-9)
+
+
+def test_a_warning_shows_a_time_without_a_unit_as_a_number():
+    result = fit(data=([0.0, *TIMES + 0.35], [40.0, *VALUES]))
+    told = "\n".join(map(str, result.warnings))
+    assert "frames of 0.2727, the first from 0 to 0.35: is a time wrong?" in told
+    assert "the reading at 0 on the clock of the data" in told
