@@ -8,6 +8,7 @@ import pytest
 from doc_pages import ROOT, blocks, hook
 
 from en4dvar.report.result import Result
+from en4dvar.results.provenance import provenance
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
 
@@ -43,6 +44,10 @@ def test_every_variable_and_attribute_is_on_the_page(result, page):
         missing = {named(result, v) for v in node.dataset.variables} - words - coordinates
         assert missing == set(), f"{group}: {sorted(missing)}"
     assert set(result.sample_stats.attrs) - words == set()
+
+
+def test_what_repeats_a_run_is_on_the_page(page):
+    assert provenance("", None).keys() - set(re.findall(r"`(\w+)`", page)) == set()
 
 
 def test_the_page_names_nothing_that_is_not_there(result, page):
