@@ -465,7 +465,7 @@ def _only(model: Any) -> str:
     """What values without a name are called: the model's first observable, else y."""
     made = model() if isinstance(model, type) and issubclass(model, ForwardModel) else model  # which may set them
     observables = getattr(made, "observables", ())
-    return observables[0].name if isinstance(observables, tuple) and observables else VALUE
+    return observables[0].name if isinstance(observables, tuple | list) and observables else VALUE
 
 
 def _digest_of_model(model: ForwardModel) -> str:

@@ -364,6 +364,12 @@ def test_values_without_a_name_are_what_a_model_named_observes(section):
     np.testing.assert_allclose(named.posterior["level"], handed.posterior["level"], rtol=1e-9)
 
 
+def test_a_model_may_declare_its_observables_in_a_list():
+    model = Trend()
+    model.observables = list(model.observables)
+    assert fit(model, priors={"level": PRIORS["a"], "slope": 0.0}).observable == "x"
+
+
 def test_a_warning_shows_a_time_without_a_unit_as_a_number():
     result = fit(data=([0.0, *TIMES + 0.35], [40.0, *VALUES]))
     told = "\n".join(map(str, result.warnings))
