@@ -12,7 +12,7 @@ SHOWN = {
     "matrix": "radius_correlation", "pairs": "time time_column", "limit": "wall_mach", "quantity": "strain_rate",
     "field": "ln_T", "kind": "analysis",
 }  # fmt: skip
-SAID = {"matrix": "correlation of the observation errors, where there is one"}
+SAID = {"matrix": "correlation of the observation errors, where there is one", "kind": SHOWN["kind"]}
 HIDDEN = {"chain", "draw", "quantile"}  # coordinates that need no words
 
 

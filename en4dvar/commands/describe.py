@@ -11,7 +11,7 @@ from en4dvar.descent.preview import Preview
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.hints import counted, rounded
 from en4dvar.plumbing.tables import table
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import may_sample, runs_of_doubt
@@ -108,14 +108,14 @@ def _series_row(problem: InverseProblem, part: Part) -> tuple[str, ...]:
     stated = y.values[own].max(), np.median(y.std[own])
     top, std = (convert(float(v), observable.unit, observable.display_unit) for v in stated)
     timing = convert(float(np.median(y.noise.time_std[own])), model.time_unit, model.time_display_unit)
-    also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
+    clock, unit = unit_after(model.time_display_unit), unit_after(observable.display_unit)
+    also = f", {timing:.3g}{clock} in time" if timing else ""
     also += y.noise.words
-    unit = observable.display_unit
-    window = f"{start:.6g} to {end:.6g} {model.time_display_unit}"
+    window = f"{start:.6g} to {end:.6g}{clock}"
     count = str(part.end - part.begin)
     if y.continued is not None:
         count += f", then {len(y.continued) - len(y)} to predict"
-    return name, count, window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
+    return name, count, window, f"{top:.4g}{unit}", f"{std:.3g}{unit}{also}"
 
 
 def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:

@@ -183,12 +183,24 @@ def checked(model: Any, who: str = "") -> ForwardModel:
             convert(1.0, unit, display_unit)
     _require_defaults(model)
     for observable in observables:
-        if isinstance(observable.operator, StateField):
-            for field in (observable.operator.name, observable.operator.rate_of):
-                if field is not None and field not in model.layout.names:
-                    words = f"the observable {observable.name!r} reads {field!r}, which is not in the layout"
-                    raise ConfigError(f"{words}{suggest(field, model.layout.names)}")
+        _require_read(model, observable)
     return model
+
+
+def _require_read(model: ForwardModel, observable: Observable) -> None:
+    """Raise :class:`ConfigError` where a field that the observable reads is not there, or has another unit."""
+    operator, who = observable.operator, f"the observable {observable.name!r}"
+    if not isinstance(operator, StateField):
+        return
+    for field in (operator.name, operator.rate_of):
+        if field is not None and field not in model.layout.names:
+            words = f"{who} reads {field!r}, which is not in the layout"
+            raise ConfigError(f"{words}{suggest(field, model.layout.names)}")
+    unit = next(field.unit for field in model.layout.fields if field.name == operator.name)
+    with retold(UnitError, ConfigError, f"{who}: "):
+        if type(operator) is StateField and unit != "1" and convert(1.0, observable.unit, unit) != 1.0:
+            words = f"{who} reads {operator.name!r}, which is in {unit}, not {observable.unit}"
+            raise ConfigError(f"{words}; give it that unit, and display_unit for tables and figures")
 
 
 def _require_defaults(model: ForwardModel) -> None:

@@ -25,7 +25,7 @@ from en4dvar.inputs.parts import Layout, cell, opened, table_of
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 
 WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
@@ -226,12 +226,12 @@ def step_doubts(
     ``scalars``: of the file, whose units nobody said, so factors of 1000 are not told from agreement. ``rate``: of the
     frames, as the user says, per ``unit``. ``display``: the unit that messages use.
     """
-    steps, cautions = np.diff(times), list[Caution]()
+    steps, cautions, behind = np.diff(times), list[Caution](), unit_after(display)
     step = float(np.median(steps))
-    told = f"the times are {convert(step, unit, display):.4g} {display} apart"
+    told = f"the times are {convert(step, unit, display):.4g}{behind} apart"
     if rate is not None and _off(np.array([step * rate]))[0] > SAME * step * rate:
         words = f"{told}, which is not a whole number of frames: at the given rate one takes "
-        cautions.append(caution("implausible-data", f"{words}{convert(1 / rate, unit, display):.4g} {display}"))
+        cautions.append(caution("implausible-data", f"{words}{convert(1 / rate, unit, display):.4g}{behind}"))
     for name, value in scalars.items():
         if value > 0 and (_STEP.fullmatch(name) or _RATE.fullmatch(name)):
             frames = step / value if _STEP.fullmatch(name) else step * value
@@ -243,8 +243,8 @@ def step_doubts(
     if len(odd) and np.mean(off < WHOLE) >= MOSTLY:
         first, after, whole = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
         words = (
-            f"{len(odd)} of {len(steps)} steps between readings are not a whole number of frames of {whole:.4g} "
-            f"{display}, the first from {first:.6g} to {after:.6g} {display}: is a time wrong?"
+            f"{len(odd)} of {len(steps)} steps between readings are not a whole number of frames of {whole:.4g}"
+            f"{behind}, the first from {first:.6g} to {after:.6g}{behind}: is a time wrong?"
         )
         cautions.append(caution("implausible-data", words, "caution"))
     return tuple(cautions)
@@ -293,7 +293,7 @@ def check_order(
         hint = f"readings of one time differ by far more than they scatter: keep one; of several series, {apart}"
     else:
         hint = "keep one of the two readings, or their mean (data.repeated: average)"
-    unit = "" if "*" in unit or unit == "1" else f" {unit}"
+    unit = "" if "*" in unit else unit_after(unit)
     where = f":{lines[kept[after]]}" if lines else f": sample {kept[after] + 1}"
     told = f"times must increase, but {written[after]:g}{unit} follows {written[before]:g}{unit}"
     raise DataError(f"{path}{where}: {told}; {hint}")

@@ -154,6 +154,11 @@ def is_unit(text: str) -> bool:
         return False
 
 
+def unit_after(unit: str) -> str:
+    """``" kPa"``, to stand after a number of a message; nothing for a dimensionless quantity."""
+    return "" if unit == "1" else f" {unit}"
+
+
 def as_unit(quantity: str, unit: str) -> str:
     """A positive quantity in whatever has the dimension of ``unit``, the usual one, as a unit itself.
 

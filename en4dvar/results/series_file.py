@@ -59,19 +59,21 @@ def _kinds(r: Any) -> Iterator[Item]:
 
 SCOPES = {"kind": _kinds}
 BARE = UnitRule("its own: coordinate `units`", lambda _, item: {}, ())
+READ = UnitRule("its own: of a sequence coordinate `observation_units`", BARE.attributes, ())
+NAME = UnitRule("", BARE.attributes, ())
 EACH = When("errors that differ in time", lambda r, _: _series(r).std.ndim == 2)
 ALIKE = When("errors that do not", lambda r, _: _series(r).std.ndim == 1)
 CORRELATED = When("correlated errors", lambda r, _: _series(r).correlation is not None)
 WEIGHTED = When("a particle filter", lambda r, _: bool(np.isfinite(r.run.effective).any()))
 
 SERIES: Table = (
-    Declared("observations", OBSERVATION, "observations", lambda r: _series(r).values, BARE),
-    Declared("observation_std", OBSERVATION, "std of the observation errors", lambda r: _series(r).std, BARE, EACH),
-    Declared("observation_std", "observation", "std of the observation errors", lambda r: _series(r).std, BARE, ALIKE),
+    Declared("observations", OBSERVATION, "observations", lambda r: _series(r).values, READ),
+    Declared("observation_std", OBSERVATION, "std of the observation errors", lambda r: _series(r).std, READ, EACH),
+    Declared("observation_std", "observation", "std of the observation errors", lambda r: _series(r).std, READ, ALIKE),
     Declared("observation_correlation", "observation observation_column", "correlation of the observation errors",
              lambda r: _series(r).correlation.matrix, when=CORRELATED),
-    Declared("predicted_mean", OBSERVATION, "forecast of the observation", lambda r: r.run.predicted.mean, BARE),
-    Declared("predicted_std", OBSERVATION, "standard deviation of that forecast", lambda r: r.run.predicted.std, BARE),
+    Declared("predicted_mean", OBSERVATION, "forecast of the observation", lambda r: r.run.predicted.mean, READ),
+    Declared("predicted_std", OBSERVATION, "standard deviation of that forecast", lambda r: r.run.predicted.std, READ),
     Declared("normalised_innovation", OBSERVATION, "innovation over its expected standard deviation",
              lambda r: normalised_innovations(_series(r), r.run)),
     Declared("rank", OBSERVATION, "place of the observation among forecast members, observation errors added, 0 to 1",
@@ -96,7 +98,7 @@ RUN_ATTRIBUTES = (
 )
 
 
-def _coordinate(name: str, dims: str, meaning: str, values: Callable[[Any], Any], unit: UnitRule = BARE) -> Declared:
+def _coordinate(name: str, dims: str, meaning: str, values: Callable[[Any], Any], unit: UnitRule = NAME) -> Declared:
     return Declared(name, dims, meaning, values, unit, fill=False)
 
 
@@ -153,7 +155,7 @@ def _members(run: SequentialState, n_members: int) -> Array:
 
 
 SEQUENCE: Table = (
-    Declared("evidence", "time", "log density of the observations given those before", lambda r: r.run.evidence, BARE),
+    Declared("evidence", "time", "log density of the observations given those before", lambda r: r.run.evidence),
     Declared("members", "member_time member state", "analysis ensemble",
              lambda r: _members(r.run, r.problem.members), BARE),
 )  # fmt: skip
@@ -199,7 +201,7 @@ def _score(what: str) -> UnitRule:
 
 TWIN: Table = (Declared("truth", STATE, "state of the truth", lambda r: r.truth, BARE),)
 SCORES: Table = (
-    Declared("{kind}_rank", STATE, "share of the {label} members below the truth", lambda _, i: i.held.rank, BARE),
+    Declared("{kind}_rank", STATE, "share of the {label} members below the truth", lambda _, i: i.held.rank),
     Declared("{kind}_rmse", "time", "RMSE of the {label} mean", lambda r, i: r.scores[i.label].rmse, _score("rmse")),
     Declared("{kind}_spread", "time", "spread of the {label}", lambda r, i: r.scores[i.label].spread,
              _score("spread")),

@@ -32,7 +32,7 @@ from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result, unpacked
+from en4dvar.results.pack import PACK, read_result, results_of, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
 from en4dvar.results.variables import BESIDE, COORDINATES, GROUPS, OPTIONAL, SCOPES
 
@@ -206,6 +206,8 @@ def posterior_file(run_dir: str | Path) -> Path:
 def load_stored(path: str | Path) -> StoredResult:
     """Read ``posterior.nc``, or an address in a pack. Raises :class:`OutputError`: no result, cut short or altered."""
     path = Path(path)
+    if path.name == PACK and path.is_file() and (held := results_of(path)):
+        raise OutputError(f"{path}: a campaign of {len(held)} data sets; give the address of one, such as {held[0]}")
     with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum
         groups = unpacked(read_result(path)) if path.parent.name == PACK else read_groups(path)
         for path_in_file, group in groups.items():

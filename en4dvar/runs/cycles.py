@@ -18,6 +18,7 @@ from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.units import unit_after
 from en4dvar.report.sequence import SequenceOutcome, TwinOutcome
 from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.netcdf import Group, to_bytes
@@ -153,8 +154,10 @@ class TwinKind(Cycles[TwinResult]):
 
     def _described(self) -> tuple[str, Any, int, str]:
         twin = self.config.experiment
-        observed = ", ".join(f"{o.name} (std {twin.error_std[o.name]:.4g}{_unit(o.unit)})" for o in twin.observables)
-        every = f"{counted(twin.cycles, 'cycle')} every {twin.interval:g}{_unit(self.config.model.time_unit)}"
+        observed = ", ".join(
+            f"{o.name} (std {twin.error_std[o.name]:.4g}{unit_after(o.unit)})" for o in twin.observables
+        )
+        every = f"{counted(twin.cycles, 'cycle')} every {twin.interval:g}{unit_after(self.config.model.time_unit)}"
         told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
         return "twin experiment", twin.prior, twin.members, told
 
@@ -190,7 +193,7 @@ class SequenceKind(Cycles[SeriesResult]):
     def _described(self) -> tuple[str, Any, int, str]:
         problem, times = self.problem, self.problem.series.times
         observed = ", ".join(observable.name for observable in problem.observables)
-        span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.config.model.time_unit)}"
+        span = f"from {times[0]:g} to {times[-1]:g}{unit_after(self.config.model.time_unit)}"
         readings = counted(np.isfinite(problem.series.values).sum(), "reading")
         told = f"{readings} of {observed} at {counted(len(times), 'time')} {span}"
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
@@ -199,7 +202,3 @@ class SequenceKind(Cycles[SeriesResult]):
 def cycles_of(config: TwinConfig | SequenceConfig) -> Cycles[Any]:
     """The run that a configuration is of."""
     return TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" {unit}"

@@ -218,7 +218,8 @@ class GivenSeries:
     """One series: its ``columns``, what they are of and their ``error``.
 
     ``name``: "" of a single one, else that in front of its columns in the data file. ``more``: what it says besides, as
-    in ``data.series``. ``used``: the columns that go to the file, by their names there; ``files``: others, with text.
+    in ``data.series``. ``index``: that of pandas, which errors share. ``used``: the columns that go to the file, by
+    their names there; ``files``: others, with text.
     """
 
     name: str
@@ -226,6 +227,7 @@ class GivenSeries:
     observable: str | None
     error: Any
     more: Mapping[str, Any]
+    index: Any = None
     used: dict[str, Array] = field(default_factory=dict, init=False)
     files: dict[str, str] = field(default_factory=dict, init=False)
 
@@ -310,6 +312,9 @@ class GivenSeries:
         if len(value) != len(self.columns[TIME]):
             counts = f"{len(value)} numbers for {len(self.columns[TIME])} readings"
             raise DataError(f"error: {self._of()}{key} has {counts}")
+        if self.index is not None and hasattr(value, "iloc") and not value.index.equals(self.index):
+            how = "align them by .reindex_like, or pass .to_numpy() to go by order"
+            raise DataError(f"error: {self._of()}{key} has another index than the readings; {how}")
         column = f"{self.name} error {key}".lstrip()
         self.used[column] = _floats(value, f"error: {self._of()}{key}")
         return {"column": column}
@@ -354,7 +359,8 @@ class Given:
             chosen: Any = observable if self.alone else str(more.get("observable", name))
             with retold(DataError, DataError, f"data: {name}: " if name else "data: "):
                 columns = columns_of(table, time, chosen or _only(self.of_section[0] if self.of_section else model))
-            self.series.append(GivenSeries(name, columns, chosen, own, more))
+            index = next((held.index for held in (table, data) if hasattr(held, "iloc")), None)
+            self.series.append(GivenSeries(name, columns, chosen, own, more, index))
 
     def prior(self, section: Any) -> Any:
         """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
@@ -459,7 +465,7 @@ def _only(model: Any) -> str:
     """What values without a name are called: the model's first observable, else y."""
     made = model() if isinstance(model, type) and issubclass(model, ForwardModel) else model  # which may set them
     observables = getattr(made, "observables", ())
-    return observables[0].name if isinstance(observables, tuple) and observables else VALUE
+    return observables[0].name if isinstance(observables, tuple | list) and observables else VALUE
 
 
 def _digest_of_model(model: ForwardModel) -> str:

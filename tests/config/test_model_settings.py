@@ -51,6 +51,11 @@ class Blind(Bare):
     observables = (Observable("x", "1", StateField("x_1")),)
 
 
+class Thousandfold(Bare):
+    layout = StateLayout((Field("x", unit="m"),))
+    observables = (Observable("x", "mm", StateField("x")),)
+
+
 class Rateless(Bare):
     observables = (Observable("x", "1", StateField("x", rate_of="v")),)
 
@@ -143,6 +148,7 @@ def test_a_field_on_a_grid_is_localised_in_cells(tmp_path, monkeypatch):
         (Blind, "", "the observable 'x' reads 'x_1', which is not in the layout; known: x"),
         (Apart, "", "Apart: unit and display unit of its times: unit '1' cannot be converted to 's'"),
         (Miscast, "", "Miscast: unit and display unit of x: unit '1' cannot be converted to 'm'"),
+        (Thousandfold, "", "the observable 'x' reads 'x', which is in m, not mm; give it that unit, and display_unit"),
         (Rateless, "", "the observable 'x' reads 'v', which is not in the layout"),
     ],
 )

@@ -119,6 +119,8 @@ def test_a_campaign_keeps_them(run_dir, tmp_path):
     for place in (tmp_path, path):
         with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a, or"):
             load_result(place)
+    with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a$"):
+        load_result(tmp_path / PACK)
     assert load_result(tmp_path / PACK / "a").parameters
 
 

@@ -8,6 +8,7 @@ import pytest
 from doc_pages import ROOT, blocks, hook
 
 from en4dvar.report.result import Result
+from en4dvar.results.provenance import provenance
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
 
@@ -45,6 +46,10 @@ def test_every_variable_and_attribute_is_on_the_page(result, page):
     assert set(result.sample_stats.attrs) - words == set()
 
 
+def test_what_repeats_a_run_is_on_the_page(page):
+    assert provenance("", None).keys() - set(re.findall(r"`(\w+)`", page)) == set()
+
+
 def test_the_page_names_nothing_that_is_not_there(result, page):
     held = page[: page.index("| coordinates |")]
     rows = re.findall(r"^\|\s*(`/[^|]*)?\| ([^|]+)\| ([^|]*)\|", held, re.M)
@@ -64,6 +69,17 @@ def test_the_page_names_nothing_that_is_not_there(result, page):
                     continue
                 assert name in there, f"{group}: {name}"
                 assert there[name] == set(re.findall(r"\w+", dims)), f"{group}: {name} has {there[name]}"
+
+
+def test_every_row_of_a_series_has_the_words_of_its_meaning_and_unit(page):
+    rows = {
+        row[0].strip("| "): row[1:]
+        for row in re.findall(r"^\|[^|]*\| (`\w+`) \|[^|]*\| ([^|]*) \| ([^|]*) \|", page, re.M)
+    }
+    assert rows["`analysis_mean`"] == ("its own: coordinate `units`", "mean of the analysis ensemble")
+    assert rows["`predicted_mean`"][0] == "its own: of a sequence coordinate `observation_units`"
+    assert (rows["`symbol`"][0], rows["`evidence`"][0]) == ("", "1")
+    assert not [row for row in page.splitlines() if "the its" in row]
 
 
 def test_the_example_reads_a_file(result, tmp_path, monkeypatch):

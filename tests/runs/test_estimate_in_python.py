@@ -177,6 +177,14 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no std": ({"error": 0.0}, "error.y_std: must be positive, not 0.0"),
     "odd error": ({"error": {"y_std": 0.1, "y_sd": 1.0}}, "error.y_sd: unknown key 'y_sd'; did you mean 'y_std'?"),
     "errors": ({"error": np.ones(3)}, "error: y_std has 3 numbers for 12 readings"),
+    "errors of other times": (
+        {"data": pd.Series(VALUES, TIMES), "error": pd.Series(np.ones(12), TIMES + 1)},
+        "error: y_std has another index than the readings; align them",
+    ),
+    "errors of other rows": (
+        {"data": pd.DataFrame({"y": VALUES}, TIMES), "observable": ["y"], "error": {"y": pd.Series(np.ones(12))}},
+        "error: y: y_std has another index than the readings; align them",
+    ),
     "no error column": ({"error": {"y_std": {"column": "sd"}}}, "data: no column 'sd'; the columns are: time, y"),
     "prior": ({"priors": {"a": {"prior": "flat"}}}, "priors.a.prior: 'flat' is not one of"),
     "prior unit": (
@@ -354,3 +362,16 @@ def test_values_without_a_name_are_what_a_model_named_observes(section):
     named = en4dvar.estimate(section, (TIMES, VALUES), prior, error=0.1, progress=False)
     handed = en4dvar.estimate(Trend, (TIMES, VALUES), prior, error=0.1, progress=False)
     np.testing.assert_allclose(named.posterior["level"], handed.posterior["level"], rtol=1e-9)
+
+
+def test_a_model_may_declare_its_observables_in_a_list():
+    model = Trend()
+    model.observables = list(model.observables)
+    assert fit(model, priors={"level": PRIORS["a"], "slope": 0.0}).observable == "x"
+
+
+def test_a_warning_shows_a_time_without_a_unit_as_a_number():
+    result = fit(data=([0.0, *TIMES + 0.35], [40.0, *VALUES]))
+    told = "\n".join(map(str, result.warnings))
+    assert "frames of 0.2727, the first from 0 to 0.35: is a time wrong?" in told
+    assert "the reading at 0 on the clock of the data" in told

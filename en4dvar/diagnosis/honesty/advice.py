@@ -17,7 +17,7 @@ from en4dvar.diagnosis.diagnostics import active_members
 from en4dvar.diagnosis.honesty.checks import moments, shown, sides_of_lost
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.schemes import MINIMISERS
 
 MANY = 48  # members that start far enough apart
@@ -128,7 +128,7 @@ class Case:
             return ""
         model, stated = self.a.problem.model, float(np.median(self.a.observations.noise.time_std))
         larger, now = (
-            f"{convert(std, model.time_unit, model.time_display_unit):.2g} {model.time_display_unit}"
+            f"{convert(std, model.time_unit, model.time_display_unit):.2g}{unit_after(model.time_display_unit)}"
             for std in (self.a.timing, stated)
         )
         return (

@@ -17,7 +17,7 @@ from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.hints import counted, listed, percent
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.prior import Prior, PriorTerm
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
@@ -157,7 +157,7 @@ def moments(analysis: Analysis) -> list[str]:
     """The times (K,) of all observations on the clock of the data, in the display unit."""
     model = analysis.problem.model
     times = convert(analysis.observations.file_times, model.time_unit, model.time_display_unit)
-    return [f"{time:.6g} {model.time_display_unit}" for time in times]
+    return [f"{time:.6g}{unit_after(model.time_display_unit)}" for time in times]
 
 
 def _chance(probability: float) -> str:
@@ -258,7 +258,7 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, tim
         beyond = reached > limit.value
         if np.mean(beyond) <= BEYOND:
             continue
-        unit = "" if limit.unit == "1" else f" {limit.unit}"
+        unit = unit_after(limit.unit)
         words = (
             f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
             f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "

@@ -35,7 +35,7 @@ from en4dvar.model.forward import (
     initial_states,
 )
 from en4dvar.model.state import Array, Field, Indices, Mask, Parameter, StateLayout
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.prior import PriorTerm
 
 SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of; else of the Gaussian score
@@ -176,8 +176,7 @@ class StateChanges:
 
 def clock(model: ForwardModel, knot: float) -> str:
     """An instant of the model in words."""
-    unit = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
-    return f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{unit}"
+    return f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{unit_after(model.time_display_unit)}"
 
 
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
