@@ -15,6 +15,7 @@ import numpy.typing as npt
 from en4dvar.model.state import Array, Mask
 
 Where = slice | npt.NDArray[np.intp]  # which readings
+LOGS = (-300.0, 300.0)  # of σ, amplitude and length: what a polynomial says beyond its runs stays a number, also squared
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Predicted:
     def unstacked(self, columns: Array) -> "Predicted":
         """The inverse of :attr:`stacked` for columns (…, Ky) of the same make, such as those of an emulator."""
         values, rates, *logs = self.parts(columns)
-        return Predicted(values, rates, *(None if log is None else np.exp(log) for log in logs))
+        return Predicted(values, rates, *(None if log is None else np.exp(np.clip(log, *LOGS)) for log in logs))
 
     def parts(self, columns: Array) -> tuple[Array, Array | None, Array | None, Array | None]:
         """Which of the columns (…, Ky) of :attr:`stacked` belong to m, ṁ, ln σ (…,), and ln of the discrepancy."""
