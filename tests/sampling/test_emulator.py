@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from en4dvar.data.noise import Predicted
 from en4dvar.sampling.emulated_cost import Coordinates, Emulator, basis, monomials
 
 
@@ -40,3 +41,11 @@ def test_a_cubic_is_returned_however_runs_count():
     emulator = Emulator.fitted(Coordinates.about(x), 3, x, cubic(x), counts, 1e-14)
     other = 2 * rng.standard_normal((20, 2))
     np.testing.assert_allclose(emulator.predictions(other), cubic(other), atol=1e-9)
+
+
+def test_what_a_polynomial_says_of_errors_far_beyond_its_runs_stays_a_number():
+    """Of logarithms of 800 and more, which no run had: σ, and amplitude and length of a discrepancy."""
+    like = Predicted(np.zeros(3), noise_scale=np.array(1.0), discrepancy=np.ones(2))
+    far = like.unstacked(np.array([[0.0, 1.0, 2.0, 900.0, -900.0, 800.0]]))
+    assert np.all(np.isfinite(far.discrepancy**2) & (far.discrepancy**2 > 0))
+    assert np.isfinite(far.noise_scale**2)
