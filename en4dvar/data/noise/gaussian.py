@@ -15,7 +15,7 @@ import numpy.typing as npt
 from en4dvar.model.state import Array, Mask
 
 Where = slice | npt.NDArray[np.intp]  # which readings
-LOGS = (-300.0, 300.0)  # of σ, amplitude and length: what a polynomial says beyond its runs stays a number, also squared
+LOGS = (-300.0, 300.0)  # of σ, amplitude, length: what a polynomial says far from its runs stays a number
 
 
 @dataclass(frozen=True)
