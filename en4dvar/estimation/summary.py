@@ -19,7 +19,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.hints import counted, percent
 from en4dvar.plumbing.tables import table
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 
 MOST_REMARKS = 3
 MOST_BRIEF = 4  # parameters in one line
@@ -128,7 +128,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
 def _narrowed(of: FieldEstimate) -> str:
     field, stds = of.prior.field, (math.sqrt(np.mean(std**2)) for std in (of.prior_std, of.std))
     shown = (convert(std, field.unit, field.display_unit) for std in stds)
-    before, after = (f"{std:.3g} {field.display_unit}".removesuffix(" 1") for std in shown)
+    before, after = (f"{std:.3g}{unit_after(field.display_unit)}" for std in shown)
     words = f"standard deviation {after} after the readings, {before} before them (root mean square)"
     return f"{field.name} of {counted(field.size, 'cell')}: {words}; see the report"
 
@@ -140,8 +140,7 @@ def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     words = []
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:
-            value = f"{convert(float(change), p.unit, p.display_unit):+.2g} {p.display_unit}"
-            value = value.removesuffix(" 1")
+            value = f"{convert(float(change), p.unit, p.display_unit):+.2g}{unit_after(p.display_unit)}"
             shown = value if np.isnan(relative) else f"{100 * relative:+.2g} %"
             shown = f"{1 + relative:.2g} times as large" if is_manifold(relative) else shown
             words.append(f"{p.name} {shown} ({abs(in_std):.1f} std)")
@@ -197,7 +196,7 @@ def brief(rows: Sequence[ParameterSummary]) -> str:
             value = f"{row.q05:.3g} to {row.q95:.3g}"
         elif row.untrusted:
             value = f"about {row.mean:.2g}"
-        words.append(f"{row.name} {value} {row.unit}".removesuffix(" 1") + " (not to be trusted)" * bool(row.untrusted))
+        words.append(f"{row.name} {value}{unit_after(row.unit)}" + " (not to be trusted)" * bool(row.untrusted))
     more = len(rows) - len(words)
     return ", ".join(words) + (f" and {more} more" if more > 0 else "")
 

@@ -97,7 +97,7 @@ class Case:
         if local is None or local.radius is None:
             return ""
         unit = next((estimate.prior.field.coordinate_unit for estimate in self.a.fields), "1")
-        now = f"{local.radius:g} {unit}".removesuffix(" 1")
+        now = f"{local.radius:g}{unit_after(unit)}"
         return f"compare with a larger assimilation.localisation.radius (it is {now}), or leave localisation out"
 
     @property

@@ -219,7 +219,7 @@ def _wider(names: Sequence[str], z: float, factor: str, timed: bool) -> str:
 
 def shown(value: float, p: Parameter) -> str:
     """A value, SI, in the display unit, with that unit."""
-    return f"{convert(value, p.unit, p.display_unit):.3g} {p.display_unit}".removesuffix(" 1")
+    return f"{convert(value, p.unit, p.display_unit):.3g}{unit_after(p.display_unit)}"
 
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
@@ -381,7 +381,7 @@ def _ends(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
 def _two(p: Parameter, between: str, first: float, second: float) -> str:
     """Two values of a parameter, SI, as displayed, with the unit behind."""
     numbers = (f"{convert(float(v), p.unit, p.display_unit):.2g}" for v in (first, second))
-    return f"{between.join(numbers)} {p.display_unit}".removesuffix(" 1")
+    return f"{between.join(numbers)}{unit_after(p.display_unit)}"
 
 
 def down_weighted(analysis: Analysis) -> Findings:

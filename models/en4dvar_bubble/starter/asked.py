@@ -179,8 +179,7 @@ class Asked:
         if self.radius_column is None:
             others = [name for name in self.contents.columns if name != self.time_column]
             alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
-            which = (alike, "each of these columns is a bubble") if alike else ("NAME", "")
-            missing.append(("--radius-column", *which))
+            missing.append(("--radius-column", alike or "NAME", "each of these columns is a bubble" if alike else ""))
         size = _only(_SIZE, self.contents.scalars)
         radii = self.radius_column or ""
         halved = bool(DIAMETER.match(radii))
