@@ -17,7 +17,7 @@ observable_unit: Unit = attrgetter("observable.unit")
 subject_unit: Unit = attrgetter("subject.unit")
 
 
-def quantity(unit: Unit, sign: Literal["positive", "not negative"], error: bool = False) -> Made:
+def quantity(unit: Unit, sign: Literal["positive", "not negative", "any"], error: bool = False) -> Made:
     """A number in ``unit``, given with a unit of its own. Of an ``error`` it is no share, where nobody says of what."""
 
     def read(text: Any, context: Context) -> float:
@@ -30,11 +30,11 @@ def quantity(unit: Unit, sign: Literal["positive", "not negative"], error: bool 
     return Made(read)
 
 
-def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
+def require_sign(value: float, sign: Literal["positive", "not negative", "any"], text: object) -> None:
     """Raises :class:`ConfigError` for a value of another sign."""
     if sign == "positive" and not value > 0:
         raise ConfigError(f"must be positive, not {brief(str(text), 80)}")
-    if value < 0:
+    if sign == "not negative" and value < 0:
         raise ConfigError(f"must not be negative, not {brief(str(text), 80)}")
 
 

@@ -68,8 +68,9 @@ def test_the_clock_can_start_where_each_file_says(tmp_path: Path) -> None:
     problems = build(load_config(path, {"data.time_zero": "{from_file: delay, unit: ms}"}))
     assert [problem.observations.zero for problem in problems] == pytest.approx([0.0, 7e-3])
     np.testing.assert_allclose(problems[0].observations.times, problems[1].observations.times)
-    later = build(load_config(path, {"data.time_zero": "{from_file: delay, unit: ms, plus: 3 ms}"}))
-    assert [problem.observations.times[0] for problem in later] == pytest.approx([1e-3, 1e-3])
+    for plus, first in (("3 ms", 1e-3), ("-3 ms", 7e-3)):
+        shifted = build(load_config(path, {"data.time_zero": f"{{from_file: delay, unit: ms, plus: {plus}}}"}))
+        assert [problem.observations.times[0] for problem in shifted] == pytest.approx([first, first])
     with pytest.raises(DataError, match=r"no scalar 'delai' for data.time_zero; did you mean 'delay'"):
         build(load_config(path, {"data.time_zero": "{from_file: delai, unit: ms}"}))
 
