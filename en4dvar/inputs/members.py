@@ -105,7 +105,8 @@ def _converted(path: Path, name: str, values: Array, unit: str, units: tuple[str
     target, stated = units
     unit = stated or unit
     if not unit and target != "1":
-        raise DataError(f"{path}: {name} has no unit there; write e.g. '{name}: {{prior: ensemble, unit: {target}}}'")
+        hint = f"netCDF has it as attribute units; a prior may say it, '{name}: {{prior: ensemble, unit: {target}}}'"
+        raise DataError(f"{path}: {name} has no unit there; {hint}")
     with retold(UnitError, DataError, f"{path}: {name}: "):
         return np.asarray(convert(values, unit or "1", target), dtype=float)
 

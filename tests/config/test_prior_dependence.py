@@ -145,7 +145,7 @@ FILES = {
         ("zero.nc", 14, "k: values must lie strictly between 0 and inf, as map: lognormal has it"),
         ("same.nc", 13, "the standard deviation"),
         ("dependent.nc", 16, "the matrix is not positive definite"),
-        ("unitless.nc", 16, "k has no unit there; write e.g. 'k: {prior: ensemble, unit: N/m}'"),
+        ("unitless.nc", 16, "k has no unit there; netCDF has it as attribute units; a prior may say it, 'k: {"),
         ("length.nc", 16, "unit 'm' cannot be converted to 'N/m'"),
         ("sets.nc", 16, "A lies along dataset, draw; members must lie along one of chain, draw"),
         ("none.nc", 16, "none.nc: no such file"),
