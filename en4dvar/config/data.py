@@ -347,24 +347,18 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
         for name, own in section.series.items():
             if not isinstance(own, dict):
                 faults.add(("series", name), "expected 'key: value' lines")
-                continue
-
-            if "name" in own:
+            elif "name" in own:
                 words = "a data set has one name; write it above the series"
                 faults.add(("series", name, "name"), words, at_key=True)
-                continue
-            if fault := _name_fault(name, {**common, **own}, context):
+            elif fault := _name_fault(name, {**common, **own}, context):
                 faults.add(("series", name), fault, at_key=True)
-                continue
+            else:
 
-            def place(where: Place, name: str = name, own: dict[str, Any] = own) -> Place:
-                return ("series", name, *where) if _has(own, where) or not _has(common, where) else where
+                def place(where: Place, name: str = name, own: dict[str, Any] = own) -> Place:
+                    return ("series", name, *where) if _has(own, where) or not _has(common, where) else where
 
-            with faults.at(schema=SeriesData, place=place):
-                plans[name] = _series(name, _merged(common, own), context)
-                if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
-                    words = "a discrepancy is that of a single series; leave it out, or estimate this series by itself"
-                    raise ConfigError(words, "error.discrepancy")
+                with faults.at(schema=SeriesData, place=place):
+                    plans[name] = _series(name, _merged(common, own), context)
         for name, others in (section.correlation or {}).items():
             for other in others:
                 _check_pair(name, other, section, faults)
@@ -400,6 +394,9 @@ def _series(name: str, keys: dict[str, Any], context: Context) -> SeriesPlan:
         raise ConfigError(f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}", "observable")
     context.observed = known[chosen]
     data = SeriesData.model_validate(keys, context=context)
+    if data.error is not None and data.error.discrepancy is not None:
+        words = "a discrepancy is that of a single series; leave it out, or estimate this series by itself"
+        raise ConfigError(words, "error.discrepancy")
     return SeriesPlan(name, known[chosen], data, data.group or name)
 
 

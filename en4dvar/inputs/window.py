@@ -30,7 +30,7 @@ from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import percent, shown
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
-_NUMBERED = re.compile(r"(minimum|trough)(?:\s+(\d+))?")
+_NUMBERED = re.compile(r"(minimum|trough)(?:\s+([1-9]\d*))?")
 _SHARE = re.compile(r"(\S+\s*%)\s+of\s+(?:the\s+)?(\S+)")
 ABOUT = 0.8  # of the maximum: the samples that are larger tell where the top is
 
@@ -69,7 +69,7 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return BY_NAME["maximum"]
     first, *others = re.split(r"\s+or\s+", word, maxsplit=1)
     instant = None
-    if (numbered := _NUMBERED.fullmatch(first)) and numbered[2] != "0":
+    if numbered := _NUMBERED.fullmatch(first):
         kind: Literal["minimum", "trough"] = "minimum" if numbered[1] == "minimum" else "trough"
         instant = Instant(kind, int(numbered[2] or 1))
     elif (said := _SHARE.fullmatch(first)) and said[2] in largest:

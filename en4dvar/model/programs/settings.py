@@ -18,7 +18,7 @@ from en4dvar.model.programs import languages
 from en4dvar.model.programs.languages import TIMES, ProgramError, check_template, input_name
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold
-from en4dvar.plumbing.files import POSIX, expanded, read_text
+from en4dvar.plumbing.files import POSIX, expanded
 from en4dvar.plumbing.hints import beside, suggest
 from en4dvar.plumbing.units import Quantity, parse_unit
 
@@ -152,8 +152,7 @@ class OutputOf(_Section):
             raise ValueError("delimiters and combinations go with instructions, and there are none")
         names: list[str] = []
         for path in itertools.chain.from_iterable(self.instruction_files.values()):
-            with retold(OSError, ValueError, f"{path}: "):
-                text = read_text(path)
+            text = languages.text_of(path)
             if not languages.is_pest(text, "if"):
                 raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
             with retold(ProgramError, ValueError):
