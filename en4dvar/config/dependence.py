@@ -274,7 +274,7 @@ class PopulationSection(Section, HyperPrior):
 
 
 SOURCE = "source"  # of a reference: where it is from
-_REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(.*)")
+_REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\d][.\deE+-]*))?\s*(.*)")
 
 
 def reference_value(text: str, unit: str) -> tuple[float, float]:

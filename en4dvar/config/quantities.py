@@ -80,13 +80,17 @@ def unit_of(target: Unit) -> Made:
 
 
 def share_of(text: Any, *wholes: str) -> Spread | None:
-    """``"1 % of maximum"`` or of another of ``wholes``; None of what says no such thing. Raises :class:`UnitError`."""
+    """``"1 % of maximum"`` or of another of ``wholes``; None of what says no such thing. Raises :class:`UnitError`,
+    :class:`ConfigError`: a negative share.
+    """
     if not (said := re.fullmatch(r"(.*?)\s*\bof\s+(?:the\s+)?(.*)", str(text).strip())):
         return None
     if not said[1].endswith("%") or said[2] not in wholes:
         example = f"write a number in % of {' or '.join(wholes)}, as '5 % of {wholes[0]}'"
         raise UnitError(f"{shown(str(text))} is no share; {example}")
-    return Spread(parse_quantity(said[1], "1"), relative=True, whole=said[2])
+    value = parse_quantity(said[1], "1")
+    require_sign(value, "not negative", text)
+    return Spread(value, relative=True, whole=said[2])
 
 
 def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:

@@ -73,6 +73,7 @@ def test_defaults_of_the_model_and_the_time_shift(tmp_path: Path) -> None:
         ("position_std: 2 um", "position_std: 1 %", "toy.yaml:8:25: data.error.position_std: '1 %' is a share, but"),
         ("position_std: 2 um", "time_std: 2 us", "toy.yaml:8:3: data.error.position_std: required"),
         ("2 um}", "2 um, time_std: -1 us}", "toy.yaml:8:41: data.error.time_std: must not be negative"),
+        ("2 um}", "2 um, time_std: -5 % of step}", "toy.yaml:8:41: data.error.time_std: must not be negative"),
         ("2 um}", "2 um}\n  window: {to: minimun 2}", "toy.yaml:9:16: data.window.to: 'minimun 2' is not an instant"),
         ("2 um}", "2 um}\n  time_zero: nucleation", "toy.yaml:9:14: data.time_zero: write file, window, top, a time o"),
         ("std: 1 %", "std: -1 %", "toy.yaml:13:42: parameters.A.std: must be positive, not -1 %"),

@@ -132,6 +132,7 @@ def test_data_sets_without_a_population_are_reported_alone(tmp_path, monkeypatch
         (3, "population: {of: [k, k]}\n", r"population of k, k: name each parameter once"),
         (3, "population: {of: []}\n", r"yaml:\d+:\d+: population\.of: "),
         (3, "population: {of: [k], reference: {q: 2 N/m}}\n", r"yaml:\d+:\d+: population\.reference\.q: 'q': neither"),
+        (3, "population: {of: [k], reference: {k: 2 ± -1 N/m}}\n", r"population\.reference\.k: .* unit '± -1 N/m'"),
         (3, "population: {of: [k], reference: {k: 2 ± 1 s}}\n", r"yaml:\d+:\d+: population\.reference\.k: '2 s'"),
         (3, "population: {of: [k], reference: {k: soft}}\n", r"population\.reference\.k: 'soft' is no value such as"),
         (3, "population: {of: [k], spread: 0}\n", r"yaml:\d+:\d+: population\.spread: "),
