@@ -55,7 +55,13 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
 
 read_error_std = or_column(read_spread, observable_unit)
 _TIME_STD = quantity(time_unit, "not negative", error=True)
-read_time_std = or_column(lambda text, context: share_of(text, "step") or _TIME_STD.make(text, context), time_unit)
+
+
+def _time_std(text: Any, context: Context) -> float | Spread:
+    return share_of(text, "step", sign="not negative") or _TIME_STD.make(text, context)
+
+
+read_time_std = or_column(_time_std, time_unit)
 
 
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:

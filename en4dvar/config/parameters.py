@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from en4dvar.config.context import Context, Faults, Made, read_each
-from en4dvar.config.quantities import SPREAD, Spread, require_sign, share_of, subject_unit, unit_of
+from en4dvar.config.quantities import SPREAD, Spread, share_of, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.varies import VariesSection
 from en4dvar.model.forward import ForwardModel
@@ -87,10 +87,7 @@ def _location(written: Any, context: Context) -> float | Spread | Scalar:
     if isinstance(written, dict):
         return Scalar.of(written, context)
     share = share_of(f"100 % of {written}" if written in [*READINGS] else written, *READINGS)
-    if share is None:
-        return _bounded(written, context.subject)
-    require_sign(share.value, "positive", written)
-    return share
+    return _bounded(written, context.subject) if share is None else share
 
 
 Location = Annotated[float | Spread | Scalar | None, Made(_location)]

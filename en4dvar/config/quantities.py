@@ -12,12 +12,13 @@ from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit, split_quantity
 
 Unit = Callable[[Context], str]
+Sign = Literal["positive", "not negative", "any"]
 time_unit: Unit = attrgetter("units.time_unit")
 observable_unit: Unit = attrgetter("observable.unit")
 subject_unit: Unit = attrgetter("subject.unit")
 
 
-def quantity(unit: Unit, sign: Literal["positive", "not negative", "any"], error: bool = False) -> Made:
+def quantity(unit: Unit, sign: Sign, error: bool = False) -> Made:
     """A number in ``unit``, given with a unit of its own. Of an ``error`` it is no share, where nobody says of what."""
 
     def read(text: Any, context: Context) -> float:
@@ -30,7 +31,7 @@ def quantity(unit: Unit, sign: Literal["positive", "not negative", "any"], error
     return Made(read)
 
 
-def require_sign(value: float, sign: Literal["positive", "not negative", "any"], text: object) -> None:
+def require_sign(value: float, sign: Sign, text: object) -> None:
     """Raises :class:`ConfigError` for a value of another sign."""
     if sign == "positive" and not value > 0:
         raise ConfigError(f"must be positive, not {brief(str(text), 80)}")
@@ -79,9 +80,9 @@ def unit_of(target: Unit) -> Made:
     return Made(fits, str)
 
 
-def share_of(text: Any, *wholes: str) -> Spread | None:
+def share_of(text: Any, *wholes: str, sign: Sign = "positive") -> Spread | None:
     """``"1 % of maximum"`` or of another of ``wholes``; None of what says no such thing. Raises :class:`UnitError`,
-    :class:`ConfigError`: a negative share.
+    :class:`ConfigError`: a share of another sign.
     """
     if not (said := re.fullmatch(r"(.*?)\s*\bof\s+(?:the\s+)?(.*)", str(text).strip())):
         return None
@@ -89,17 +90,21 @@ def share_of(text: Any, *wholes: str) -> Spread | None:
         example = f"write a number in % of {' or '.join(wholes)}, as '5 % of {wholes[0]}'"
         raise UnitError(f"{shown(str(text))} is no share; {example}")
     value = parse_quantity(said[1], "1")
-    require_sign(value, "not negative", text)
+    require_sign(value, sign, text)
     return Spread(value, relative=True, whole=said[2])
 
 
 def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
-    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
+    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``; positive. Raises :class:`ConfigError`,
+    :class:`UnitError`.
+    """
     if share := share_of(text, whole):
         return share
     word = str(text).strip()
     require_no_share(word, unit, f"'{word} of {whole}' or ")
-    return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
+    value = parse_quantity(text, unit)
+    require_sign(value, "positive", text)
+    return Spread(value, unit=split_quantity(word)[1])
 
 
 def require_no_share(text: str, unit: str, rather: str = "") -> None:
@@ -110,6 +115,4 @@ def require_no_share(text: str, unit: str, rather: str = "") -> None:
 
 
 def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
-    spread = parse_error_std(text, unit(context), whole)
-    require_sign(spread.value, "positive", text)
-    return spread
+    return parse_error_std(text, unit(context), whole)

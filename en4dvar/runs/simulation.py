@@ -139,11 +139,9 @@ def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, 
     for name, observable in observables.items():
         try:
             spread = parse_error_std(text, observable.unit)
-        except UnitError as error:
+        except (ConfigError, UnitError) as error:
             each = "; of several series, '1 % of maximum' is of each" if len(observables) > 1 else ""
             raise UnitError(f"--noise of {name}: {error}{each}") from None
-        if not spread.value > 0:
-            raise UnitError(f"the noise must be positive, not {text}")
         levels[name] = spread.absolute(float(simulation.series[name].max()))
     return levels
 
