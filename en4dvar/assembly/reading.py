@@ -14,7 +14,7 @@ from typing import cast
 
 import numpy as np
 
-from en4dvar.config.data import Data, DataPlan, SeriesPlan, TimeZero, ZeroOfFile
+from en4dvar.config.data import Data, DataPlan, SeriesPlan, TimeZero
 from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import DecayingErrors, Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
@@ -194,10 +194,11 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
 
 
-def _zero_of(asked: TimeZero | float | ZeroOfFile, read: Readings, first: float, path: Path) -> float:
+def _zero_of(asked: TimeZero | float | tuple[Column, float], read: Readings, first: float, path: Path) -> float:
     """Where the model's clock starts on that of the file, of which the ``first`` reading is used."""
-    if isinstance(asked, ZeroOfFile):
-        return scalar_of(asked.scalar, read.scalars, path, "data.time_zero") + asked.plus
+    if isinstance(asked, tuple):
+        scalar, plus = asked
+        return scalar_of(scalar, read.scalars, path, "data.time_zero") + plus
     if asked == "top":
         return vertex(read.times, read.values)
     return {"file": 0.0, "window": first}[asked] if isinstance(asked, str) else asked

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
@@ -155,20 +155,14 @@ class TimeOfFile(Section):
     """A time that is added to it, the same for all files: from the trigger to the pulse's arrival."""
 
 
-class ZeroOfFile(NamedTuple):
-    """A scalar of each file, and what is added to it in the model's unit."""
-
-    scalar: Column
-    plus: float
-
-
 TIME_OR_SCALAR = {"anyOf": [TEXT, TimeOfFile.model_json_schema()]}
 
 
-def read_time_zero(written: Any, context: Context) -> TimeZero | float | ZeroOfFile:
+def read_time_zero(written: Any, context: Context) -> TimeZero | float | tuple[Column, float]:
+    """Of a scalar of each file with what is added to it, in the model's unit."""
     if isinstance(written, Mapping):
         it = TimeOfFile.model_validate(written, context=context)
-        return ZeroOfFile(Column(it.from_file, it.unit, time_unit(context)), it.plus)
+        return Column(it.from_file, it.unit, time_unit(context)), it.plus
     if written in get_args(TimeZero):
         return cast(TimeZero, written)
     with retold(UnitError, UnitError, "write file, window, top, a time or {from_file: NAME, unit: UNIT}: "):
@@ -211,7 +205,7 @@ class Data(Section):
     seen in the whole file."""
     columns: Annotated[Columns, OfObservable("column role")]
     window: WindowSection = Field({}, validate_default=True)
-    time_zero: Annotated[TimeZero | float | ZeroOfFile, Made(read_time_zero, json=TIME_OR_SCALAR)] = Field(
+    time_zero: Annotated[TimeZero | float | tuple[Column, float], Made(read_time_zero, json=TIME_OR_SCALAR)] = Field(
         "file", validate_default=True
     )
     """Where the model's clock starts: file (the file's own zero), window (the first observation used), top (the vertex

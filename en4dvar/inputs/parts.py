@@ -201,8 +201,6 @@ def cell(row: Sequence[str], i: int) -> str:
 
 def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     where = {name: table.position(name) for name in wanted}
-    if not table.rows:
-        raise DataError(f"{table.path}: no data: no line follows the header")
     columns = {name: table.numbers(i, name) for name, i in where.items()}
     for line, cells in table.rows:
         if any(cells[len(table.names) :]):
@@ -252,12 +250,9 @@ def read_contents(path: Path, layout: Layout = ANY) -> Contents:
 
 def _variable_contents(path: Path, held: Variables) -> Contents:
     columns = held.columns()
-    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in held.others.items()}
-    words |= {
-        name: f"{path}: {name} is {held.others[name]}; its columns are {name}(:,1), {name}(:,2), …, its rows "
-        f"{name}(1,:), …"
-        for name in held.matrices
-    }
+    parts = {n: f"its columns are {n}(:,1), {n}(:,2), …, its rows {n}(1,:), …" for n in held.matrices}
+    otherwise = "save what is in it as vectors"
+    words = {name: f"{path}: {name} is {kind}; {parts.get(name, otherwise)}" for name, kind in held.others.items()}
     for name in columns:  # a struct of which something can be read is no fault
         words.pop(name.partition(".")[0], None)
     return Contents(columns, held.scalars, words)
@@ -267,14 +262,10 @@ def _table_contents(table: Table, scalars: Mapping[str, float]) -> Contents:
     columns: dict[str, Array] = {}
     others: dict[str, str] = {}
     for i, name in enumerate(table.names):
-        if not name:  # behind a delimiter that ends every line
-            continue
-        if not table.rows:
-            others[name] = f"{table.path}: no line follows the header"
-            continue
-        try:
-            columns[name] = table.numbers(i, name)
-        except DataError as error:
-            others[name] = str(error)
+        if name:  # none behind a delimiter that ends every line
+            try:
+                columns[name] = table.numbers(i, name)
+            except DataError as error:
+                others[name] = str(error)
     unsure = {name: it for i, name in enumerate(table.names) if name in columns and (it := table.unsure(i))}
     return Contents(columns, scalars, others, table.units, unsure)

@@ -153,6 +153,8 @@ class Table:
 
     def numbers(self, i: int, name: str) -> Array:
         """A column as numbers. Raises :class:`DataError`."""
+        if not self.rows:
+            raise DataError(f"{self.path}: no data: no line follows the header")
         cells = self._cells(self.rows, i)
         signs = self._decimal_signs(i)
         if len(signs) > 1 and (unsure := next((k for k, cell in enumerate(cells) if is_open(cell)), None)) is not None:

@@ -296,7 +296,7 @@ def test_bubbles_side_by_side_are_named_by_a_pattern() -> None:
     ("text", "message"),
     [
         ("t,R\nus,um\n", "b.csv:2: 'us' in column 't' is not a number"),
-        ("t,R\n", "b.csv: no line follows the header"),
+        ("t,R\n", "b.csv: no data: no line follows the header"),
     ],
 )
 def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: str, message: str) -> None:

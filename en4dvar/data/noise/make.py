@@ -37,13 +37,12 @@ class Block:
 @dataclass(frozen=True)
 class BlockNoise(Noise):
     """``correlation`` (K, K) of the readings, None where no two are correlated; ``thresholds`` (K,) of the robust cost,
-    inf where the errors are Gaussian; ``sides`` (K,) of :class:`BoundNoise`, 0 of readings that are no bound, None
-    where none is.
+    inf where the errors are Gaussian; ``sides`` (K,) of :class:`BoundNoise`, 0 of readings that are no bound.
     """
 
     correlation: csr_array | None
     thresholds: Array
-    sides: Array | None = None
+    sides: Array
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -54,12 +53,8 @@ class BlockNoise(Noise):
             robust = np.isfinite(self.thresholds[block.where]).any()
             if not block.noise.independent and robust:
                 raise ValueError("a robust cost needs independent observation errors")
-            if np.any(self._bounds[block.where]) and (robust or not block.noise.independent):
+            if np.any(self.sides[block.where]) and (robust or not block.noise.independent):
                 raise ValueError("bounds (at_most, at_least) need independent errors without a robust cost")
-
-    @cached_property
-    def _bounds(self) -> Array:
-        return np.zeros(len(self.std)) if self.sides is None else self.sides
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -71,9 +66,9 @@ class BlockNoise(Noise):
         for where, matrix in self._groups():
             alone[where] = False
             yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], Correlation(matrix)))
-        if len(where := np.flatnonzero(alone & (self._bounds != 0))):
+        if len(where := np.flatnonzero(alone & (self.sides != 0))):
             alone[where] = False
-            yield Block(where, BoundNoise(self.std[where], self.time_std[where], self._bounds[where]))
+            yield Block(where, BoundNoise(self.std[where], self.time_std[where], self.sides[where]))
         for threshold in np.unique(self.thresholds[alone]):
             where = np.flatnonzero(alone & (self.thresholds == threshold))
             errors = self.std[where], self.time_std[where]
@@ -157,7 +152,7 @@ class BlockNoise(Noise):
         return white
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
-        bounds = {} if self.sides is None else record_of(self.sides)
+        bounds = record_of(self.sides) if np.any(self.sides) else {}
         if self.correlation is None:
             return bounds
         entries = self.correlation.tocoo()
@@ -236,7 +231,7 @@ def noise_of_readings(
     Where all are of one kind it is that kind. Raises :class:`ValueError` where the matrix is no correlation.
     """
     within = np.full(len(std), math.inf) if thresholds is None else thresholds
-    noise = BlockNoise(std, time_std, correlation, within, sides if np.any(sides) else None)
+    noise = BlockNoise(std, time_std, correlation, within, np.zeros(len(std)) if sides is None else sides)
     return noise.blocks[0].noise if len(noise.blocks) == 1 else noise
 
 
