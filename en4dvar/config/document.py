@@ -33,7 +33,7 @@ OPTIONS = {"data.path": "--data", "execution.address": "--scheduler"}  # keys th
 NOT_UTF8 = "a byte that is not UTF-8, in the name of a file or folder perhaps, which then needs another one"
 NULL = "a null byte, which no name, word or number holds"
 _INT = re.compile(r"[-+]?\d{1,40}")
-_FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
+_FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?\Z")
 _WORDS = {
     ".inf": math.inf, "-.inf": -math.inf, "true": True, "True": True, "false": False, "False": False,
     "null": None, "~": None, "": None,
@@ -134,11 +134,17 @@ def document_of(content: Mapping[Any, Any]) -> Document:
     return replace(document, data=data, text=yaml_text(data))
 
 
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Compiled where PyYAML has it; quotes what :func:`_scalar` reads as a number and PyYAML as text: 08, 1e5."""
+
+
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("+-.0123456789"))
+
+
 def yaml_text(data: Any) -> str:
-    """Plain data as YAML, in its own order; by the compiled library where PyYAML has it."""
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    """Plain data as YAML, in its own order."""
     with retold(UnicodeEncodeError, ConfigError, f"{NOT_UTF8}: "):
-        return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=120))
+        return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120))
 
 
 def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> Any:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from en4dvar.config.document import override, parse_document, read_document
+from en4dvar.config.document import override, parse_document, read_document, yaml_text
 from en4dvar.plumbing.errors import ConfigError
 
 
@@ -66,6 +66,14 @@ def test_override_leaves_the_document_and_names_its_origin() -> None:
     for bad in ("a.b.c", "a..c", ""):
         with pytest.raises(ConfigError, match="--set"):
             override(document, {bad: 1})
+
+
+def test_what_is_written_is_read_as_it_was() -> None:
+    """A resolved file that held the name of a column, 08, unquoted could be read no more."""
+    texts = ["08", "1e5", "1E-5", "+.5", "1e500", "007", "5", "1.5", "2026-01-01", "no", "null", "", ".inf", "08 gel"]
+    data = {"texts": texts, "numbers": [1e5, 1e-5, 1e22, -3, 10**20, 0.1], "1e5": True, "08": None}
+    assert parse_document(yaml_text(data)).data == data
+    assert "- 08 gel\n" in yaml_text(data)
 
 
 def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
