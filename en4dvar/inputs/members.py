@@ -16,7 +16,7 @@ from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_whole
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import listed, suggest
-from en4dvar.plumbing.tables import is_number
+from en4dvar.plumbing.tables import is_number, unescaped
 from en4dvar.plumbing.units import UnitError, convert
 
 
@@ -95,7 +95,7 @@ def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, fl
             if not np.isfinite(centre).all():
                 raise DataError(f"{path}: the centre of {name} of {row['dataset']} is no finite number")
             own = _converted(path, name, centre, row["unit"], (units[name], ""))
-            sets.setdefault(row["dataset"], {})[name] = own.item()
+            sets.setdefault(unescaped(row["dataset"]), {})[name] = own.item()
     if not sets:
         raise DataError(f"{path}: no data set has {listed(units)}")
     return sets

@@ -61,6 +61,15 @@ def _plain(cell: str) -> str:
     return cell if is_number(cell) else f"'{cell}"
 
 
+def unescaped(cell: str) -> str:
+    """The text that :func:`csv_text` wrote as this cell.
+
+    >>> unescaped("'-a"), unescaped("'a")
+    ('-a', "'a")
+    """
+    return cell[1:] if cell[:1] == "'" and _plain(cell[1:]) == cell else cell
+
+
 def is_number(cell: Any) -> bool:
     """Whether ``float`` takes it."""
     try:

@@ -13,7 +13,9 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.load import values_of
 from en4dvar.config.parameters import Uncertain
 from en4dvar.config.schema import GivenStart
+from en4dvar.inputs.members import read_centres
 from en4dvar.model.state import Parameter
+from en4dvar.plumbing.tables import write_csv
 from en4dvar.runs.runner import run_campaign
 
 TIMES = np.linspace(0.1, 2.0, 12)
@@ -94,6 +96,12 @@ def test_a_campaign_starts_from_its_neighbours(tmp_path):
     summary.write_text(whole.replace(",A,", ",B,").replace(",k,", ",K,"), encoding="utf-8")
     with pytest.raises(en4dvar.ConfigError, match=r"start.from: .*: no data set has A, k"):
         load_config(path, again)
+
+
+def test_names_that_a_spreadsheet_would_take_for_formulas(tmp_path):
+    names = ("-10C", "+5C", "'x", "20C")
+    rows = [("dataset", "name", "unit", "centre"), *((name, "k", "N/m", 2.0) for name in names)]
+    assert read_centres(write_csv(tmp_path / "summary.csv", rows), {"k": "N/m"}) == {n: {"k": 2.0} for n in names}
 
 
 def told(start, words):
