@@ -63,7 +63,9 @@ def find_files(
         with retold(PathError, DataError):
             path = base / expanded(text)
         if glob.has_magic(text) and not os.path.exists(path):
-            every = sorted(map(Path, glob.glob(str(path), recursive=True)), key=natural)
+            root = next(folder for folder in path.parents if os.path.isdir(folder))  # whose name is no pattern
+            inner = glob.glob(str(path.relative_to(root)), root_dir=root, recursive=True)
+            every = sorted((root / name for name in inner), key=natural)
             if not (matches := _without_truths(every, left_out)):
                 raise DataError(f"{path}: no file matches")
             paths += matches

@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Self, cast
 
@@ -24,7 +23,7 @@ from en4dvar.estimation.population import HyperPrior
 from en4dvar.inputs.members import read_members, read_square
 from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
-from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.hints import matches, shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_places
 from en4dvar.priors.prior import PriorTerm
@@ -332,7 +331,7 @@ class Sharing:
         groups = [
             group
             for group, patterns in self.groups[kind].items()
-            if any(fnmatchcase(name, pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns))
+            if any(matches(name, pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns))
         ]
         if len(groups) == 1:
             return groups[0]

@@ -10,7 +10,6 @@ used but those that HDF5 brings along.
 MathWorks, *MAT-File Format* (R2019b), *MAT-File Versions*; the layout of HDF5 is that of ``save(…, '-v7.3')``.
 """
 
-import fnmatch
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,6 +25,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import open_plain
+from en4dvar.plumbing.hints import matches
 
 MAT = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
 LONGEST = 4_000_000_000  # bytes of a file of version 5, which is read whole
@@ -87,7 +87,7 @@ class Variables:
             if max(matrix.shape) <= WIDEST:
                 names += [f"{name}(:,{k + 1})" for k in range(matrix.shape[1])]
                 names += [f"{name}({k + 1},:)" for k in range(matrix.shape[0])]
-        return tuple(name for name in names if fnmatch.fnmatchcase(name, pattern))
+        return tuple(name for name in names if matches(name, pattern))
 
     def of(self, part: str) -> "Variables":
         """What is not inside an array, and of arrays the element ``part`` under names without the index."""

@@ -18,11 +18,11 @@ import numpy as np
 from en4dvar.inputs.decimal_sign import Decimal
 from en4dvar.inputs.formats import SUFFIXES, Disorder, Format, Outliers, Repeated
 from en4dvar.inputs.matfile import Variables, indexed, mat_variables
-from en4dvar.inputs.text_table import Table, matches, scalars_in, sheet_lines
+from en4dvar.inputs.text_table import Table, scalars_in, sheet_lines
 from en4dvar.inputs.window import BY_NAME, Instant
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.hints import listed
+from en4dvar.plumbing.hints import listed, matches
 
 VARIABLES: dict[str, Callable[[Path], Variables]] = {"mat": mat_variables}  # format → reader; the others are tables
 SHEETS = (".xls", ".xlsb", ".ods")
@@ -154,7 +154,7 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
             table = table_of(path, kind, layout, [value.name, *(c for c in (time, layout.by) if c is not None)])
             if layout.by is not None:
                 return _groups(table, layout.by)
-            if value.name in table.names:
+            if not several or value.name in table.names:
                 return ()
             return tuple(name for name in table.names if matches(name, value.name) and name != time)
         variables = _variables(path, kind, layout)

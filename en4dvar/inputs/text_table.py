@@ -9,7 +9,6 @@ before openpyxl sees it.
 """
 
 import csv
-import fnmatch
 import itertools
 import re
 import unicodedata
@@ -27,7 +26,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_plain
-from en4dvar.plumbing.hints import listed, short, suggest
+from en4dvar.plumbing.hints import listed, matches, short, suggest
 from en4dvar.plumbing.tables import is_number
 from en4dvar.plumbing.units import is_unit
 
@@ -196,11 +195,6 @@ class Table:
         return f"; nothing in the line is a number: delete it, or {another}" if between else ""
 
 
-def matches(name: str, pattern: str) -> bool:
-    """Whether a pattern with ``*`` stands for a name."""
-    return "*" in pattern and fnmatch.fnmatchcase(name, pattern)
-
-
 def _names_and_numbers(
     head: Sequence[Sequence[str]], signs: Sequence[str], wanted: Sequence[str]
 ) -> tuple[int | None, int]:
@@ -210,7 +204,7 @@ def _names_and_numbers(
     names, as comments stand below units.
     """
     for i, cells in enumerate(head if wanted else ()):
-        if all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted):
+        if all(any(_same(cell, name) or ("*" in name and matches(cell, name)) for cell in cells) for name in wanted):
             return i, i + 1
     first = _first_of_numbers(head, signs)
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from pathlib import Path
 from reprlib import Repr
 
@@ -119,6 +120,16 @@ def nearest(name: str, others: Collection[str]) -> str:
     'bubble10'
     """
     return max((n for n in others if numbered(n) <= numbered(name)), key=numbered, default=min(others, key=numbered))
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Whether a pattern, as a shell has it, stands for a name; brackets and ``?`` may stand for themselves.
+
+    >>> matches("R_1 [um]", "R_* [um]"), matches("a_1", "[ab]_?"), matches("a_1", "b_*")
+    (True, True, False)
+    """
+    literal = pattern.replace("[", "[[]").replace("?", "[?]")
+    return fnmatchcase(name, pattern) or fnmatchcase(name, literal)
 
 
 def short(text: str, most: int = 60) -> str:

@@ -110,6 +110,8 @@ def test_value_from_a_mat_file(tmp_path: Path) -> None:
 
 
 def test_campaign(tmp_path: Path) -> None:
+    tmp_path /= "gel [1]"  # brackets in the name of a folder are no pattern
+    tmp_path.mkdir()
     path = write_toy(tmp_path)
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()

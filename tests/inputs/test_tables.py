@@ -146,6 +146,10 @@ def test_bubbles_of_a_sheet(tmp_path):
     several = Column("R_*", "um", "um")
     assert parts_of(path, several) == ("R_1", "R_2")
     assert read_series(path, TIME, several, part="R_2").values.tolist() == [2, 3, 4]
+    path = tmp_path / "c.csv"
+    path.write_text("t,R_1 [um],R_2 [um],R_1 [px]\n0,1,2,3\n1,2,3,4\n2,3,4,5\n")
+    assert parts_of(path, Column("R_* [um]", "um", "um")) == ("R_1 [um]", "R_2 [um]")
+    assert read_series(path, TIME, Column("R_* [um]", "um", "um"), part="R_2 [um]").values.tolist() == [2, 3, 4]
 
 
 def test_a_further_format_of_variables_is_read_in_every_way(tmp_path, monkeypatch):
