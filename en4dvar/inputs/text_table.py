@@ -1,7 +1,7 @@
 """Tables, cells as text: lines, header and numbers of a CSV file or an Excel workbook, and where in it a fault is.
 
 Text is UTF-8, else UTF-16 with its mark or Windows' cp1252. Column names that look alike (µ and μ, composed and
-decomposed umlauts) are the same.
+decomposed umlauts, blanks at the ends) are the same.
 
 Numbers of workbooks (``.xlsx``) are those that Excel stored: no formula is evaluated, no macro, link or query is looked
 at. A workbook is a zip archive from anybody: what it unpacks to is bounded, and XML that declares entities is refused,
@@ -263,7 +263,7 @@ def _words(cells: Sequence[str]) -> bool:
 
 
 def _same(a: str, b: str) -> bool:
-    return unicodedata.normalize("NFKC", a) == unicodedata.normalize("NFKC", b)
+    return unicodedata.normalize("NFKC", a).strip() == unicodedata.normalize("NFKC", b).strip()
 
 
 def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | None) -> float:

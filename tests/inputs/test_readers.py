@@ -133,7 +133,7 @@ def test_decimal_commas_are_read_where_it_is_said(tmp_path: Path, text: str) -> 
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-@pytest.mark.parametrize("asked", ["Größe [\u00b5m]", "Größe [\u03bcm]", "Gro\u0308ße [\u00b5m]"])
+@pytest.mark.parametrize("asked", ["Größe [\u00b5m]", "Größe [\u03bcm]", "Gro\u0308ße [\u00b5m]", " Größe [\u00b5m] "])
 def test_text_of_windows_and_names_that_look_alike(tmp_path: Path, encoding: str, asked: str) -> None:
     path = tmp_path / "a.txt"
     path.write_bytes("t;Größe [\u00b5m]\r\n0;1\r\n1;2\r\n2;3\r\n".encode(encoding))
