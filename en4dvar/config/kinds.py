@@ -135,7 +135,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         prior=prior,
         fixed=fixed,
     )
-    return TwinConfig(**read.common(()), experiment=experiment, scheme=file.assimilation.scheme)
+    return read.validated(TwinConfig, experiment=experiment, scheme=file.assimilation.scheme)
 
 
 APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
@@ -207,7 +207,7 @@ class SequenceConfig(Validated):
     data: DataPlan
     parameters: tuple[Entry, ...]
     sequence: Sequence
-    model_error: tuple[ErrorOf, ...]
+    model_error: tuple[ErrorOf, ...] = ()
     assimilation: Sequential
     execution: Workers
     scheme: str
@@ -232,16 +232,8 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         faults.append(document.fault(("sequence",), "nothing is uncertain: give initial_std, or a parameter a prior"))
     if faults:
         raise ConfigError(faults)
-    return SequenceConfig(
-        **read.common(file.parameters),
-        observable=file.data.series[0].observable,
-        data=file.data,
-        parameters=file.parameters,
-        sequence=file.sequence,
-        model_error=file.model_error or (),
-        assimilation=file.assimilation,
-        scheme=file.assimilation.scheme,
-    )
+    observable = file.data.series[0].observable
+    return read.validated(SequenceConfig, observable=observable, scheme=file.assimilation.scheme)
 
 
 def _unfit(entry: Entry, model: ForwardModel) -> str:

@@ -1,7 +1,7 @@
 """From a YAML file to a frozen :class:`Config`, or every fault of the file at once."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -93,7 +93,7 @@ class Config(Validated):
 
     observable: Observable
     parameters: tuple[Entry, ...]
-    data: DataPlan | None
+    data: DataPlan | None = None
     assimilation: AssimilationSettings
     weights: Literal["sum", "mean", "balanced"]
     execution: Execution
@@ -150,24 +150,20 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     minimiser = settings.own.minimiser
     if minimiser and isinstance(minimiser.start, GivenStart):
         settings = replace(settings, own=replace(minimiser, start=values_of(minimiser.start, parameters, document)))
-    return Config(
-        **read.common(file.parameters),
+    return read.validated(
+        Config,
         observable=file.data.series[0].observable if file.data else read.model.observables[0],
         parameters=parameters,
-        data=file.data,
         assimilation=settings,
         weights=file.assimilation.weights,
         simulate_times=file.simulate.times if file.simulate else None,
         sharing=Sharing.of(parameters, file.groups or {}, bool(blocks), several, document),
-        initial_state=file.initial_state or (),
-        model_error=file.model_error or (),
         dependence=blocks,
-        design=file.design or Design(),
-        population=file.population,
     )
 
 
 S = TypeVar("S", bound=Section)
+V = TypeVar("V", bound=Validated)
 
 
 @dataclass(frozen=True)
@@ -179,22 +175,23 @@ class Read(Generic[S]):
     document: Document
     model_section: dict[str, Any]
 
-    def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
-        """The fields of :class:`Validated`, and ``execution``, of a file with a section ``output``. ``resolved`` is the
-        file with overrides and defaults written out and paths absolute, as YAML that loads again.
+    def validated(self, kind: type[V], **more: Any) -> V:
+        """A file with a section ``output``, of a ``kind`` whose fields are those of the file, and ``more``.
+
+        ``resolved`` is the file with overrides and defaults written out and paths absolute, as YAML that loads again.
         """
         file: Any = self.file
+        own = {f.name: value for f in fields(kind) if (value := getattr(file, f.name, None)) is not None}
         where = file.output.directory or Path("runs") / file.name
         said = {"directory": where, "report": file.output.report, "figures": file.output.figures}
         content = file.as_written(self.document.data)
         content["model"] = self.model_section
-        for entry in parameters:
+        for entry in own.get("parameters", ()):
             name, unit = entry.parameter.name, entry.parameter.unit
             if isinstance(entry, Fixed) and name not in content["parameters"]:
                 content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
-        resolved = yaml_text(content)
-        said |= {"document": self.document, "model": self.model, "name": file.name, "seed": file.seed}
-        return {**said, "execution": file.execution, "resolved": resolved}
+        said |= {"document": self.document, "model": self.model, "resolved": yaml_text(content)}
+        return kind(**own | said | more)
 
 
 def require_kind(schema: type[Section], document: Document) -> None:
