@@ -21,6 +21,7 @@ from en4dvar.series.model_error import ModelError
 from en4dvar.series.settings import EnKS, EnRTS, Inflation, SequentialSettings
 from en4dvar.series.start import EnsembleCoordinates
 
+PLAIN = EnsembleCoordinates()
 STD = quantity(subject_unit, "positive", error=True)
 
 
@@ -123,25 +124,19 @@ class Sequential(_OnASeries):
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
             return  # told already
         # settings that do not go together are told here, in their place
-        anywhere = BlockLocalisation((), np.empty((0, 0)))
-        settings = SequentialSettings(
-            self.made, localisation=anywhere if self.localisation else None,
-            smoother=self.smoother.made if self.smoother else None,
-        )  # fmt: skip
+        anywhere = BlockLocalisation((), np.empty((0, 0))) if self.localisation else None
+        self.built(anywhere, np.zeros(1))
         with faults.at("additive"):
-            replace(settings, model_error=ModelError(np.ones(1), self.additive))
-
-    @property
-    def made(self) -> Any:
-        """The scheme. Raises ValueError where its keys do not suit each other."""
-        return ON_A_SERIES[self.scheme](**self.own)
+            self.built(anywhere, np.ones(1))
 
     def built(
-        self, localisation: BlockLocalisation | None, rate: Array, coordinates: EnsembleCoordinates
+        self, localisation: BlockLocalisation | None, rate: Array, coordinates: EnsembleCoordinates = PLAIN
     ) -> SequentialSettings:
-        """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time."""
+        """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time. Raises ValueError where
+        keys do not suit each other.
+        """
         return SequentialSettings(
-            self.made,
+            ON_A_SERIES[self.scheme](**self.own),
             Inflation(self.inflation, self.rtps),
             self.rotation,
             localisation,
