@@ -4,7 +4,6 @@
 the ``groups:``, which have one value in several data sets; the ``population:`` section.
 """
 
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -89,33 +88,25 @@ class PriorFile(Section):
     """posterior.nc of an earlier run, other netCDF with a variable a parameter, or a CSV file with a column each."""
 
 
-def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
-    """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
-    Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix.
+def joined(blocks: Sequence[Dependence]) -> tuple[Dependence, ...]:
+    """What shares a name as one block, zero where nothing is said. Raises :class:`ConfigError`: a pair of which two say
+    something, or no correlation matrix.
     """
-    groups: list[list[int]] = []
-    for k, (names, _) in enumerate(blocks):
-        touching = [group for group in groups if any({*names} & {*blocks[i][0]} for i in group)]
-        merged = [*itertools.chain.from_iterable(touching), k]
-        groups = [*(group for group in groups if group not in touching), merged]
-    return tuple(_one_block([blocks[k] for k in sorted(group)]) for group in groups)
+    from scipy.sparse.csgraph import connected_components  # not needed to import the package
 
-
-def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Dependence:
-    if len(parts) == 1:
-        return Dependence(*parts[0])
-    names = tuple(dict.fromkeys(name for each, _ in parts for name in each))
+    names = tuple(dict.fromkeys(name for block in blocks for name in block.names))
     matrix, said = np.eye(len(names)), np.eye(len(names), dtype=bool)
-    for each, part in parts:
-        Dependence(each, part)  # a fault of it alone is told of it alone
-        columns = [names.index(name) for name in each]
+    for block in blocks:
+        columns = [names.index(name) for name in block.names]
         where = np.ix_(columns, columns)
         again = said[where] & ~np.eye(len(columns), dtype=bool)
         if again.any():
             i, j = np.argwhere(again)[0]
-            raise ConfigError(f"the correlation of {each[i]} and {each[j]} is given twice")
-        matrix[where], said[where] = part, True
-    return Dependence(names, matrix)
+            raise ConfigError(f"the correlation of {block.names[i]} and {block.names[j]} is given twice")
+        matrix[where], said[where] = block.matrix, True
+    count, which = connected_components(said, directed=False)
+    each = (np.flatnonzero(which == k) for k in range(count))
+    return tuple(Dependence(tuple(names[i] for i in own), matrix[np.ix_(own, own)]) for own in each)
 
 
 def resolved(
@@ -148,11 +139,11 @@ def resolved(
                     raise ConfigError(f"{name} cannot be correlated: {alone[name]}")
                 if name not in estimated:
                     raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
-            parts.append((section.between, section.of_all(read_square)))
-            Dependence(*parts[-1])
+            parts.append(Dependence(section.between, section.of_all(read_square)))
     if not faults:
         with document.collecting(faults, "prior_correlation"):
-            return tuple(made.get(e.parameter.name, e) for e in entries), (*dependence, *joined(parts))
+            dependence += joined(parts) if parts else ()
+            return tuple(made.get(e.parameter.name, e) for e in entries), dependence
     raise ConfigError(faults)
 
 
