@@ -179,7 +179,7 @@ class SequenceFile(File):
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        for place, error in _errors(keys.get("data")):
+        for place, error in _errors({"data": keys.get("data")}):
             for key in APART:
                 if key in error and (key != "discrepancy" or "series" not in place):  # which several series never have
                     message = "not in a sequence, where the errors of every instant are Gaussian and for themselves"
@@ -188,15 +188,13 @@ class SequenceFile(File):
             faults.add(("model",), "has no step: it cannot go on from a state on its way, as a sequence needs")
 
 
-def _errors(data: Any) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+def _errors(keys: Mapping[str, Any], *above: str) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
     """The sections of errors, of one series or of several, and where they are."""
-    if not isinstance(data, dict):
-        return
-    series = data.get("series")
-    each = [(("series", name), section) for name, section in series.items()] if isinstance(series, dict) else []
-    for place, section in [((), data), *each]:
-        if isinstance(section, dict) and isinstance(section.get("error"), dict):
-            yield ("data", *place, "error"), section["error"]
+    for key, section in keys.items():
+        if isinstance(section, dict):
+            if key == "error":
+                yield (*above, key), section
+            yield from _errors(section, *above, key)
 
 
 @dataclass(frozen=True, kw_only=True)
