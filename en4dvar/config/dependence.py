@@ -31,7 +31,7 @@ KINDS = ("correlation", "matrix", "file", "kernel")
 Patterns = str | tuple[str, ...]
 Grouped = Mapping[str, Mapping[str, Patterns]]  # kind → group → patterns of names
 
-A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)], {"type": "string"})
+A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)])
 Position = float | tuple[float, ...]
 
 

@@ -14,6 +14,7 @@ from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator
 
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.data import DATA, DataPlan
+from en4dvar.config.dependence import A_FILE
 from en4dvar.config.document import Document
 from en4dvar.config.load import Read, Validated, read_file
 from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
@@ -33,13 +34,6 @@ from en4dvar.series.start import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
 
 
-def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
-    """The absolute path and the matrix."""
-    with retold((DataError, ValueError), ConfigError):
-        file = context.path(path)
-        return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
-
-
 class Twin(Section):
     """How the truth is made and observed."""
 
@@ -51,9 +45,7 @@ class Twin(Section):
     """Time between two observations, in the model's unit of time."""
     error: Annotated[dict[str, float], stds(lambda model: {f"{o.name}_std": o for o in model.observables})]
     """Std of the observation errors, by observable: ``<observable>_std``."""
-    error_correlation: (
-        Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
-    ) = None
+    error_correlation: Annotated[Path, A_FILE] | None = None
     """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
     header; relative to the configuration's folder. Default: independent errors."""
     initial_std: Annotated[dict[str, float], stds(dynamic_fields)]
@@ -62,11 +54,6 @@ class Twin(Section):
     def check_values(self, faults: Faults) -> None:
         if self.burn_in >= self.cycles:
             raise ValueError(f"burn_in ({self.burn_in}) leaves none of {self.cycles} cycles")
-
-    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was written, with an absolute path."""
-        written = super().as_written(source)
-        return written | ({"error_correlation": self.error_correlation[0]} if self.error_correlation else {})
 
 
 class TwinFile(File):
@@ -122,6 +109,10 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     prior = Prior(terms) if terms else None
     with document.placing():
         rate = error_rates(model, file.model_error or ())
+    correlation = None
+    if twin.error_correlation:
+        with document.placing("twin", "error_correlation"), retold((DataError, ValueError), ConfigError):
+            correlation = Correlation(read_covariance(Matrix(twin.error_correlation, "1", "1")))
     experiment = TwinExperiment(
         model=model,
         sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
@@ -131,7 +122,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         error_std=observed,
         initial_std=twin.initial_std,
         burn_in=twin.burn_in,
-        error_correlation=twin.error_correlation[1] if twin.error_correlation else None,
+        error_correlation=correlation,
         prior=prior,
         fixed=fixed,
     )
