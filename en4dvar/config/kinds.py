@@ -17,11 +17,11 @@ from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.dependence import A_FILE
 from en4dvar.config.document import Document
 from en4dvar.config.load import Read, Validated, read_file
-from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
+from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.quantities import Spread, quantity, time_unit
 from en4dvar.config.schema import File, Name, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
-from en4dvar.config.varies import MODEL_ERROR, ErrorOf, Estimated, dynamic_fields
+from en4dvar.config.varies import MODEL_ERROR, ErrorOf, dynamic_fields
 from en4dvar.data.noise import Correlation
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import Matrix
@@ -158,7 +158,7 @@ class SequenceFile(File):
 
     data: DATA
     """Where the observations are, what they mean and how well they are known."""
-    parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
+    parameters: Annotated[tuple[Entry, ...], entries("a sequence", data=True)] = Field({}, validate_default=True)
     """For each parameter a prior (estimated beside the state), a quantity or a scalar of the data file (fixed)."""
     sequence: Sequence
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
@@ -211,11 +211,6 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         for name in file.sequence.positive
         if name in file.sequence.initial_std and not file.sequence.initial_std[name].relative
     ]
-    faults += [
-        document.fault(("parameters", entry.parameter.name), words)
-        for entry in file.parameters
-        if (words := _unfit(entry, read.model))
-    ]
     uncertain = file.sequence.initial_std or any(isinstance(entry, Uncertain) for entry in file.parameters)
     if not uncertain:
         faults.append(document.fault(("sequence",), "nothing is uncertain: give initial_std, or a parameter a prior"))
@@ -223,22 +218,6 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         raise ConfigError(faults)
     observable = file.data.series[0].observable
     return read.validated(SequenceConfig, observable=observable, scheme=file.assimilation.scheme)
-
-
-def _unfit(entry: Entry, model: ForwardModel) -> str:
-    """Why a sequence cannot have this entry; "" where it can."""
-    name = entry.parameter.name
-    if name not in {p.name for p in model.parameters}:
-        return "a sequence knows parameters of the model alone: neither time shift nor noise scale"
-    if isinstance(entry, Tied):
-        return "a sequence has no tied parameters; give a value or a prior"
-    if isinstance(entry, Uncertain) and entry.spec.prior == "ensemble":
-        return "a sequence takes no ensemble as a prior; give its moments"
-    if isinstance(entry, Uncertain) and entry.spec.varies and isinstance(entry.spec.varies.std, Estimated):
-        return "a sequence does not estimate the std of a walk; give it in % or in the unit of the parameter"
-    if isinstance(entry, Uncertain) and name not in model.layout.names:
-        return f"the state of the model has no field {name!r}, through which a sequence estimates it; give it a value"
-    return ""
 
 
 class GroupSection(Section):

@@ -10,7 +10,7 @@ from pydantic import Field
 from en4dvar.config.context import Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, Spread, share_of, subject_unit, unit_of
 from en4dvar.config.schema import Section
-from en4dvar.config.varies import VariesSection
+from en4dvar.config.varies import Estimated, VariesSection
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, retold
@@ -302,24 +302,31 @@ def _missing(parameter: Parameter) -> str:
     )
 
 
-def _needs_of_a_data_set(entry: Entry) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Keys of an entry that need the data of one set, each with what a file without such data lacks."""
-    if entry.needs_data:
+def _of_an_estimation(entry: Entry, model: ForwardModel, data: bool) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Keys of an entry that an estimation alone knows, each with what a file of another kind lacks; ``data``: it has
+    data, from which the state is estimated.
+    """
+    if entry.needs_data and not data:
         yield (), "has no data file to take a value from"
     if isinstance(entry, Tied):
         yield ("tied",), "has no tied parameters; give a value or a prior"
     if isinstance(entry, Uncertain):
+        name, varies = entry.parameter.name, entry.spec.varies
         if entry.spec.prior == "ensemble":
             yield ("prior",), "has no ensemble of its own; give it another prior"
-        if entry.spec.varies is not None:
+        if varies is not None and not data:
             yield ("varies",), "has constant parameters"
+        elif varies is not None and isinstance(varies.std, Estimated):
+            yield ("varies",), "does not estimate the std of a walk; give it in % or in the unit of the parameter"
         if entry.spec.shared is not None:
             yield ("shared",), "estimates no data sets together"
+        if data and name not in model.layout.names:
+            yield (), f"estimates by a field of the state, and the model has no field {name!r}; give it a value"
 
 
-def entries(kind: str = "") -> Made:
+def entries(kind: str = "", data: bool = False) -> Made:
     """One entry for every parameter of the model, in its order, then those of the readings if given. ``kind``: what the
-    file is, where it names no data from which a value could come.
+    file is, where it is no estimation; ``data``: it names some, from which a value may come.
     """
 
     def read(section: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
@@ -334,7 +341,9 @@ def entries(kind: str = "") -> Made:
 
         def unknown(name: str) -> str:
             if kind and name in of_readings:
-                return f"{kind} makes its own readings: keys of their own say when and with which errors"
+                words = "knows parameters of the model alone: neither time shift nor noise scale"
+                made = "makes its own readings: keys of their own say when and with which errors"
+                return f"{kind} {words if data else made}"
             needed = model.absent_parameters.get(name)
             hint = f"; the model has it only with {needed}" if needed else suggest(name, labels)
             return f"unknown parameter {shown(name)}{hint}"
@@ -347,7 +356,7 @@ def entries(kind: str = "") -> Made:
                 if isinstance(entry, Tied) and (entry.to in parameters or entry.to not in section):  # else that is told
                     with faults.at(name):
                         entry.check(parameters, [p.name for p in model.parameters])
-                for key, lacking in _needs_of_a_data_set(entry) if kind else ():
+                for key, lacking in _of_an_estimation(entry, model, data) if kind else ():
                     faults.add((name, *key), f"{kind} {lacking}")
             for parameter in model.parameters:
                 if parameter.name not in {**section, **model.defaults}:

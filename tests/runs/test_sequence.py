@@ -197,6 +197,8 @@ SCHEME = BASE["assimilation"]
          "does not estimate the std"),
         ({"parameters": {"c": {**BASE["parameters"]["c"], "mean": 0, "varies": {"std": "10 %", "every": 1}}}},
          "parameters.c.varies.std", "relative to the mean, which is zero"),
+        ({"parameters": {"c": {**BASE["parameters"]["c"], "shared": "all"}}}, "parameters.c.shared",
+         "a sequence estimates no data sets together"),
         ({"parameters": {"c": 1, "t_s": {"prior": "normal", "mean": 0, "std": 1}}}, "parameters.t_s", "time shift"),
         ({"model": {"name": "lorenz63", "steps": 3}}, "model.steps", "unknown key"),
         ({"assimilation": {**SCHEME, "additive": "root"}}, "assimilation.additive", "not one of drawn, square-root"),
