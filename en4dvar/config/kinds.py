@@ -17,6 +17,7 @@ from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.dependence import A_FILE
 from en4dvar.config.document import Document
 from en4dvar.config.load import Read, Validated, read_file
+from en4dvar.config.of_readings import BESIDE
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.quantities import Spread, quantity, time_unit
 from en4dvar.config.schema import File, Name, Output, Section
@@ -129,9 +130,6 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     return read.validated(TwinConfig, experiment=experiment, scheme=file.assimilation.scheme)
 
 
-APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
-
-
 def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
     known = dynamic_fields(context.model)
     with Faults() as faults:
@@ -171,7 +169,7 @@ class SequenceFile(File):
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
         for place, error in _errors({"data": keys.get("data")}):
-            for key in APART:
+            for key in BESIDE:
                 if key in error and (key != "discrepancy" or "series" not in place):  # which several series never have
                     message = "not in a sequence, where the errors of every instant are Gaussian and for themselves"
                     faults.add((*place, key), message, at_key=True)

@@ -22,7 +22,7 @@ import numpy as np
 
 from en4dvar.inputs.text_table import WIDEST
 from en4dvar.model.state import Array
-from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_plain
+from en4dvar.plumbing.decoding import MOST_OBJECTS, Allowed, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import matches
@@ -31,7 +31,6 @@ MAT = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
 LONGEST = 4_000_000_000  # bytes of a file of version 5, which is read whole
 HEADER = 128  # bytes
 DEEPEST = 4  # structs inside structs
-MOST_OBJECTS = 100_000
 FILTERS = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum
 MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
 MOST_IN_MATRICES = 1 << 22  # in all matrices of a file: what is larger is a film, not a table

@@ -27,12 +27,11 @@ from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_plain
 from en4dvar.plumbing.hints import listed, matches, short, suggest
-from en4dvar.plumbing.tables import is_number
+from en4dvar.plumbing.tables import COMMENT, is_number
 from en4dvar.plumbing.units import is_unit
 
 Line = str | Sequence[str]  # of a text, or the cells of a sheet
 Lines = Sequence[tuple[int, Line]]
-COMMENT = ("#", "%", "//")
 LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "#n/a", "-")

@@ -10,6 +10,7 @@ from typing import IO, Any
 from en4dvar.plumbing.files import atomic_path
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # but for tabs and ends of lines
+COMMENT = ("#", "%", "//")  # begins a line of text that is none of a table
 _FORMULA = tuple("=+-@＝＋－＠")  # a spreadsheet evaluates a cell that begins so; in wide characters as well
 
 

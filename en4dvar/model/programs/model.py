@@ -31,10 +31,8 @@ from en4dvar.plumbing.decoding import LONGEST_TEXT, Allowed, decoded_whole, matc
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import POSIX
 from en4dvar.plumbing.hints import listed, short
-from en4dvar.plumbing.tables import is_number
+from en4dvar.plumbing.tables import COMMENT, is_number
 from en4dvar.plumbing.user_code import Code, require_permission
-
-COMMENT = ("#", "%", "//")
 
 
 def read(
