@@ -75,7 +75,7 @@ MARKS = Made(
 )
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, InUnit.model_json_schema()]}
 
-LogStd = Annotated[float, Field(gt=0)]
+LogStd = Annotated[float, Field(gt=0), "Standard deviation of the natural logarithm."]
 
 
 class AmplitudeSection(Section):
@@ -84,7 +84,6 @@ class AmplitudeSection(Section):
     median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
     """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
     log_std: LogStd = 1.5
-    """Standard deviation of the natural logarithm."""
 
 
 class LengthSection(Section):
@@ -95,7 +94,6 @@ class LengthSection(Section):
     )
     """A time, or e.g. '10 % of window'."""
     log_std: LogStd = 0.7
-    """Standard deviation of the natural logarithm."""
 
 
 class DiscrepancySection(Section):
