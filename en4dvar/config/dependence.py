@@ -89,24 +89,31 @@ class PriorFile(Section):
 
 
 def joined(blocks: Sequence[Dependence]) -> tuple[Dependence, ...]:
-    """What shares a name as one block, zero where nothing is said. Raises :class:`ConfigError`: a pair of which two say
-    something, or no correlation matrix.
-    """
+    """Those that share names as one. Raises :class:`ConfigError` as :func:`_one_block`."""
     from scipy.sparse.csgraph import connected_components  # not needed to import the package
 
-    names = tuple(dict.fromkeys(name for block in blocks for name in block.names))
+    share = [[not {*block.names}.isdisjoint(other.names) for other in blocks] for block in blocks]
+    count, which = connected_components(np.array(share), directed=False)
+    return tuple(_one_block([blocks[i] for i in np.flatnonzero(which == k).tolist()]) for k in range(count))
+
+
+def _one_block(parts: Sequence[Dependence]) -> Dependence:
+    """Zero where nothing is said. Raises :class:`ConfigError`: a pair of which two say something, or no correlation
+    matrix.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    names = tuple(dict.fromkeys(name for part in parts for name in part.names))
     matrix, said = np.eye(len(names)), np.eye(len(names), dtype=bool)
-    for block in blocks:
-        columns = [names.index(name) for name in block.names]
+    for part in parts:
+        columns = [names.index(name) for name in part.names]
         where = np.ix_(columns, columns)
         again = said[where] & ~np.eye(len(columns), dtype=bool)
         if again.any():
             i, j = np.argwhere(again)[0]
-            raise ConfigError(f"the correlation of {block.names[i]} and {block.names[j]} is given twice")
-        matrix[where], said[where] = block.matrix, True
-    count, which = connected_components(said, directed=False)
-    each = (np.flatnonzero(which == k) for k in range(count))
-    return tuple(Dependence(tuple(names[i] for i in own), matrix[np.ix_(own, own)]) for own in each)
+            raise ConfigError(f"the correlation of {part.names[i]} and {part.names[j]} is given twice")
+        matrix[where], said[where] = part.matrix, True
+    return Dependence(names, matrix)
 
 
 def resolved(
