@@ -487,13 +487,3 @@ def test_the_mode_beside_heavy_tails_meets_its_conditions(larger):
     lag = np.sqrt(3) * np.abs(np.subtract.outer(times, times)) / length[:, None, None]
     covariance = larger**2 * ((1 + lag) * np.exp(-lag) + 1e-6 * np.eye(62))
     assert delta == pytest.approx(np.einsum("bij,bj->bi", covariance, u), rel=1e-8, abs=1e-8 * larger)
-
-
-@pytest.mark.parametrize("amplitude", [1e200, np.inf, np.nan])
-def test_a_member_far_off_is_lost_beside_correlated_errors_without_a_warning(amplitude):
-    noise = noise_of(np.full(K, 0.1), correlation=CORRELATION, discrepancy=Kernel(TIMES, 1.5))
-    run = Predicted(np.zeros((2, K)), discrepancy=np.array([[amplitude, 1.0], [0.2, 1.0]]))
-    for told in (noise.log_likelihood(TIMES, run), noise.log_conditional(TIMES, run)):
-        assert np.isnan(told[0]).all()
-        assert np.isfinite(told[1]).all()
-    assert np.array_equal(np.isinf(noise.cost(TIMES, np.ones(K), run)), [True, False])

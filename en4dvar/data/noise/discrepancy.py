@@ -273,7 +273,6 @@ class DiscrepancyNoise(Noise):
     def _light(self, values: Array, predicted: Predicted) -> Array:
         return np.ones(predicted.values.shape)
 
-    @np.errstate(over="ignore", invalid="ignore")  # of members far off, whose whitened residuals are NaN
     def covariance(self, predicted: Predicted, light: Array | float = 1.0) -> Array:
         """R/w + A (…, K, K), w how much readings count: ``light`` (…, K), or one number."""
         errors = self.covariance_of_errors(predicted) / np.expand_dims(light, -1)
