@@ -13,8 +13,7 @@ Sources: Kennedy & O'Hagan (2001), J. R. Stat. Soc. B 63, 425 (discrepancy); Mar
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -29,6 +28,8 @@ from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.model.state import Array
 from en4dvar.priors.dependence import KERNELS
 
+AT_ONCE = 1 << 15  # elements of covariance matrices in one call: they stay in the processor's cache
+BORDER = 1e300  # beside it every square of a whitened residual is nothing
 SAME = 1e-12  # relative eigenvalue of an information that counts as none
 NUGGET = 1e-10  # of the amplitude squared, on the diagonal: smooth kernels of close readings are singular to rounding
 SMOOTHNESS = {"exponential": 0.5, "matern-3/2": 1.5, "matern-5/2": 2.5}  # name → ν
@@ -228,14 +229,17 @@ class DiscrepancyNoise(Noise):
 
     def log_conditional(self, values: Array, predicted: Predicted) -> Array | None:
         """Conditional densities of N(m, R + A), as for correlated errors; NaN where that is singular to rounding."""
-        runs = in_rows(predicted)
-        density = np.full(runs.values.shape, np.nan)
-        for own, residual, covariance in zip(density, values - runs.values, self._covariances(runs), strict=True):
-            with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-                precision = np.linalg.inv(covariance)
-                p = np.diag(precision)
-                own[:] = 0.5 * (np.log(p) - (precision @ residual) ** 2 / p) - self._log_norm()
-        return density.reshape(predicted.values.shape)
+
+        def conditional(runs: Predicted) -> tuple[Array]:
+            try:
+                precision = np.linalg.inv(self.covariance(runs))
+            except np.linalg.LinAlgError:
+                return (np.full_like(runs.values, np.nan),)
+            scaled = np.einsum("bij,bj->bi", precision, values - runs.values)
+            own = np.diagonal(precision, axis1=1, axis2=2)
+            return (0.5 * (np.log(own) - scaled**2 / own) - self._log_norm(),)
+
+        return np.asarray(self._in_parts(predicted, 1, conditional)[0])
 
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
         p, light = at.prediction, self._light(values, at.prediction)
@@ -298,15 +302,21 @@ class DiscrepancyNoise(Noise):
                 directions.append(Direction(errors * np.add.outer(s, s), discrepancy * np.add.outer(g, g), unit))
         return directions
 
-    def _covariances(self, runs: Predicted) -> Iterator[Array]:
-        """R + A (K, K) of each of the runs (B, K)."""
-        return (self.covariance(runs[i]) for i in range(len(runs.values)))
+    def _in_parts(self, predicted: Predicted, arrays: int, evaluate: Callable[[Predicted], Sequence[Array]]) -> Array:
+        """(arrays, …, K) of what ``evaluate`` gives of some of the runs at a time."""
+        runs = in_rows(predicted)
+        joined = np.empty((arrays, *runs.values.shape))
+        chunk = max(1, AT_ONCE // runs.values.shape[-1] ** 2)
+        for first in range(0, len(runs.values), chunk):
+            part = slice(first, first + chunk)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                joined[:, part] = evaluate(runs[part])
+        return joined.reshape(arrays, *predicted.values.shape)
 
     def _innovations(self, values: Array, predicted: Predicted) -> Array:
         """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R/w + A is all but singular."""
         if self.correlation is not None:
-            runs = in_rows(predicted)
-            return whitened(values - runs.values, self._covariances(runs)).reshape(2, *predicted.values.shape)
+            return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
         with np.errstate(over="ignore", invalid="ignore"):
             residual, s, a, length = self._in_time(values, predicted)
             variance = s**2 / self._light(values, predicted).reshape(s.shape)
@@ -419,14 +429,30 @@ def in_rows(predicted: Predicted) -> Predicted:
     return predicted.each(lambda part: np.reshape(part, (-1, *np.shape(part)[leading:])))
 
 
-def whitened(residuals: Array, covariances: Iterable[Array]) -> Array:
-    """L⁻¹r and the diagonal of L (2, B, K) of residuals (B, K), each with a covariance (K, K); NaN where L is not."""
-    white = np.full((2, *residuals.shape), np.nan)
-    for own, residual, covariance in zip(white.swapaxes(0, 1), residuals, covariances, strict=True):
-        with suppress(ValueError):  # not finite, or, as numpy has it, not positive definite
-            root = np.linalg.cholesky(covariance)
-            own[:] = solve_triangular(root, residual, lower=True), np.diag(root)
-    return white
+def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:
+    """L⁻¹r and the diagonal of L, each (B, K), for residuals (B, K) and covariances (B, K, K); NaN where there is no L.
+    The Cholesky factor of a covariance that is bordered by the residual has L⁻¹r as its last row.
+    """
+    count, k = residuals.shape
+    bordered = np.empty((count, k + 1, k + 1))
+    bordered[:, :k, :k] = covariances
+    bordered[:, k, :k] = bordered[:, :k, k] = residuals
+    bordered[:, k, k] = BORDER
+    known = np.isfinite(bordered).all(axis=(1, 2))
+    bordered[~known] = np.eye(k + 1)
+    try:
+        roots = np.linalg.cholesky(bordered)
+    except np.linalg.LinAlgError:
+        roots = np.stack([_root_or_nan(matrix) for matrix in bordered])
+    roots[~known] = np.nan
+    return roots[:, k, :k], np.diagonal(roots, axis1=1, axis2=2)[:, :k]
+
+
+def _root_or_nan(matrix: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 def both_sides(root: Array, matrix: Array) -> Array:
