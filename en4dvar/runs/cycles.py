@@ -119,7 +119,7 @@ class Cycles(RunKind[R]):
         fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
         before, keeper = run.kept(file, fingerprint, SequentialState, "it is assimilated from the start")
         if before is not None:
-            run.log.write(f"continued after {before.cycle} of {self.cycles} cycles")
+            run.log(f"continued after {before.cycle} of {self.cycles} cycles")
         latest: list[Callable[[], SequentialState]] = []
 
         def keep(state: Callable[[], SequentialState]) -> None:
@@ -129,7 +129,7 @@ class Cycles(RunKind[R]):
         result = self.assimilated(executor, before, keep)
         for state in latest:  # what it ends with is kept, too, so that it is never repeated
             keeper.write(state())
-        run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
+        run.log("\n".join(f"member lost: {reason}" for reason in result.run.failures))
         own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
         to_bytes({"/": series_group(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))

@@ -196,7 +196,7 @@ class DesignKind(RunKind[Designs]):
             self._evaluate(kept, executor, list(told), "nested")
 
     def _say(self, kept: KeptUnits[Done], words: str) -> None:
-        kept.log.write(words)
+        kept.log(words)
         if self.tell_cost:
             self.tell_cost(words)
 

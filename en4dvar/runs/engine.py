@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from types import GenericAlias
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
@@ -117,23 +117,17 @@ class RunKind(Kind, ABC, Generic[R]):
         """End what computes in threads of this process."""
 
 
-class Log(Protocol):
-    """Where a run at work writes what it does."""
-
-    def write(self, message: str, /) -> None: ...
-
-
 @dataclass
 class Session:
     """A run at work in its directory.
 
-    ``attributes`` go into its result files; ``notices`` are what the run itself found worth a warning. It has ``begun``
-    once its directory says what it is.
+    ``log`` writes down what it does. ``attributes`` go into its result files; ``notices`` are what the run itself found
+    worth a warning. It has ``begun`` once its directory says what it is.
     """
 
     config: Any
     directory: RunDirectory
-    log: Log
+    log: Callable[[str], None]
     identity: Identity
     attributes: Mapping[str, str]
     notices: list[str] = field(default_factory=list)
@@ -177,7 +171,7 @@ class Session:
     def notice(self, message: str) -> None:
         """Something about the run itself that the user should know."""
         self.notices.append(message)
-        self.log.write(f"warning: {message}")
+        self.log(f"warning: {message}")
 
 
 class KeptUnits(Generic[S]):
@@ -201,7 +195,7 @@ class KeptUnits(Generic[S]):
                 reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
                 ended = failed(*calls[i], reason=reason)
             self.done.append(ended)
-            self.log.write(line(ended))
+            self.log(line(ended))
             self.keeper.keep(lambda: tuple(self.done))
             if tell:
                 tell(total - len(calls) + count, total)
@@ -292,7 +286,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
             "configuration_resolved": config.resolved,
         }
         with RunLog(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
-            run = Session(config, directory, log, who, attributes)
+            run = Session(config, directory, log.write, who, attributes)
             try:
                 log.write(attributes["history"])
                 yield run

@@ -98,7 +98,7 @@ class TogetherKind(Kind, ABC):
             configs = {s.config.resolved: s.config for s in sets}.values()
             made_of = [repr(self), *(identity(c.resolved, c.model, {}).settings for c in configs)]
             made_of += [file_digest(run_dir / name) for run_dir in run_dirs for name in (PACK, "posterior.nc")]
-            session = Session(config, directory, _Terminal(tell), Identity("", ()), attributes)
+            session = Session(config, directory, tell, Identity("", ()), attributes)
             try:
                 directory.claim(*names, record, under_way(record))
                 directory.folder(FOLDER)
@@ -165,17 +165,10 @@ class TogetherKind(Kind, ABC):
         try:
             self._estimate(
                 run, sets, executor, attributes, file, record, [run.identity.settings, *digests],
-                lambda words: run.log.write(f"{what}: {words}"),
+                lambda words: run.log(f"{what}: {words}"),
             )  # fmt: skip
         except TooFewMembersError as error:
             run.notice(f"no {what}; the data sets are estimated alone: {error}")
-
-
-@dataclass(frozen=True)
-class _Terminal:
-    """In place of the log of a run: ``write`` tells the user."""
-
-    write: Tell
 
 
 def under_way(record: str) -> str:

@@ -278,7 +278,7 @@ class Worklist:
             self.ended[d.name] = None
             if d.iteration in left:  # of a run killed between its last two steps
                 self.run.directory.remove(d.iteration)
-        self.run.log.write(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
+        self.run.log(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
 
     def estimate_again(self, names: Sequence[str]) -> None:
         """Forget that data sets are done, whose results cannot be read."""
@@ -338,7 +338,7 @@ class Worklist:
         again = f"{d.name} is estimated from the start"
         before = self.run.restore(d.iteration, fingerprint, KnownRuns, again) or KnownRuns()
         if before.forecasts:
-            self.run.log.write(f"{d.name}: continued after {counted(sum(map(len, before.forecasts)), 'forward run')}")
+            self.run.log(f"{d.name}: continued after {counted(sum(map(len, before.forecasts)), 'forward run')}")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
         folder = Path(self.config.document.file).parent  # from which the configuration names the data; pages are shared
         source = readable(SEVERAL.join(path_from(folder, str(path)) for path in d.source.paths))
@@ -356,7 +356,7 @@ class Worklist:
 
     def _tell(self, records: Sequence[Told], *lines: str) -> None:
         """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""
-        self.run.log.write("\n".join([*(line for told in records for line in self._lines(*told)), *lines]))
+        self.run.log("\n".join([*(line for told in records for line in self._lines(*told)), *lines]))
         if self.progress is not None:
             for name, record, _ in records:
                 self.progress(name, record)
@@ -388,9 +388,9 @@ class Worklist:
             raise error
         known = isinstance(error, En4dvarError)
         reason = readable(error if known else f"{type(error).__name__}: {error}")
-        self.run.log.write(f"{d.name}: failed: {reason}")
+        self.run.log(f"{d.name}: failed: {reason}")
         if not known:
-            self.run.log.write("".join(traceback.format_exception(error)))
+            self.run.log("".join(traceback.format_exception(error)))
         if len(self.sets) == 1:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
