@@ -130,7 +130,7 @@ class Cycles(RunKind[R]):
         for state in latest:  # what it ends with is kept, too, so that it is never repeated
             keeper.write(state())
         run.log("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
+        own = {"name": self.config.name, "scheme": self.config.scheme}
         to_bytes({"/": series_group(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))
         return result

@@ -284,6 +284,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
+            "identity": who.settings,
         }
         with RunLog(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
             run = Session(config, directory, log.write, who, attributes)

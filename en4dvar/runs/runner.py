@@ -189,10 +189,9 @@ def _estimate(work: Worklist, executor: Executor) -> None:
         good = work.good()
         if work.alone or not good:
             return
-        attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         try:
             path, sources = work.run.directory.at("posterior.nc"), {d.name: d.stem for d in good}
-            save_campaign(path, work.pack, sources, attributes, work.failures())
+            save_campaign(path, work.pack, sources, work.run.attributes, work.failures())
             return
         except DamagedError as error:
             if not repeated.isdisjoint(error.names):

@@ -160,8 +160,7 @@ class TogetherKind(Kind, ABC):
         def sets() -> list[Finished]:
             return [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
 
-        attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
-        attributes |= {"group": group.name} if group else {}
+        attributes = {**run.attributes, "runs": config.name, **({"group": group.name} if group else {})}
         try:
             self._estimate(
                 run, sets, executor, attributes, file, record, [run.identity.settings, *digests],

@@ -202,8 +202,7 @@ class Worklist:
         self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
-        attributes = {**run.attributes, "identity": run.identity.settings}
-        self.common: CommonValue[Common] = CommonValue((config, attributes))
+        self.common: CommonValue[Common] = CommonValue((config, run.attributes))
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 
     def good(self) -> list[Dataset]:
