@@ -25,11 +25,11 @@ from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
 from en4dvar.series.moments import SequentialState
-from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
-from en4dvar.series.twin import TwinResult, conduct
+from en4dvar.series.problem import SeriesProblem, assimilate_series
+from en4dvar.series.twin import conduct
 
 Keep = Callable[[Callable[[], SequentialState]], None]
-R = TypeVar("R", SeriesResult, TwinResult)
+R = TypeVar("R", SequenceOutcome, TwinOutcome)
 
 
 def run_twin(
@@ -46,8 +46,7 @@ def run_twin(
 
     Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
-    kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)
-    return TwinOutcome(**vars(conduct_run(kind, force, resume, command)))
+    return conduct_run(TwinKind(loaded(config, load_twin, overrides), on_cycle), force, resume, command)
 
 
 def run_sequence(
@@ -65,8 +64,7 @@ def run_sequence(
 
     Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
-    kind = SequenceKind(loaded(config, load_sequence, overrides), on_cycle)
-    return SequenceOutcome(**vars(conduct_run(kind, force, resume, command)))
+    return conduct_run(SequenceKind(loaded(config, load_sequence, overrides), on_cycle), force, resume, command)
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ class Cycles(RunKind[R]):
         return result
 
 
-class TwinKind(Cycles[TwinResult]):
+class TwinKind(Cycles[TwinOutcome]):
     """A configuration with a ``twin:`` section."""
 
     name = "twin"
@@ -149,8 +147,9 @@ class TwinKind(Cycles[TwinResult]):
     def cycles(self) -> int:
         return int(self.config.experiment.cycles)
 
-    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
-        return conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinOutcome:
+        result = conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+        return TwinOutcome(**vars(result))
 
     def _described(self) -> tuple[str, Any, int, str]:
         twin = self.config.experiment
@@ -162,7 +161,7 @@ class TwinKind(Cycles[TwinResult]):
         return "twin experiment", twin.prior, twin.members, told
 
 
-class SequenceKind(Cycles[SeriesResult]):
+class SequenceKind(Cycles[SequenceOutcome]):
     """A configuration with a ``sequence:`` section."""
 
     name = "sequence"
@@ -187,8 +186,9 @@ class SequenceKind(Cycles[SeriesResult]):
     def cycles(self) -> int:
         return len(self.problem.series.times)
 
-    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
-        return assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SequenceOutcome:
+        result = assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+        return SequenceOutcome(**vars(result))
 
     def _described(self) -> tuple[str, Any, int, str]:
         problem, times = self.problem, self.problem.series.times
@@ -199,6 +199,6 @@ class SequenceKind(Cycles[SeriesResult]):
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
 
 
-def cycles_of(config: TwinConfig | SequenceConfig) -> Cycles[Any]:
+def cycles_of(config: TwinConfig | SequenceConfig, on_cycle: Callable[[int], None] | None = None) -> Cycles[Any]:
     """The run that a configuration is of."""
-    return TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
+    return (TwinKind if isinstance(config, TwinConfig) else SequenceKind)(config, on_cycle)
