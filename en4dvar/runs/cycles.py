@@ -20,7 +20,7 @@ from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import unit_after
 from en4dvar.report.sequence import SequenceOutcome, TwinOutcome
-from en4dvar.results.checkpoint import FOLDER, digest
+from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
@@ -114,8 +114,7 @@ class Cycles(RunKind[R]):
 
     def conduct(self, run: Session, executor: Executor) -> R:
         file = f"{FOLDER}/{self.name}.cycle"
-        fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
-        before, keeper = run.kept(file, fingerprint, SequentialState, "it is assimilated from the start")
+        before, keeper = run.kept(file, run.fingerprint, SequentialState, "it is assimilated from the start")
         if before is not None:
             run.log(f"continued after {before.cycle} of {self.cycles} cycles")
         latest: list[Callable[[], SequentialState]] = []

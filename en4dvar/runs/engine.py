@@ -19,7 +19,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
-from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
+from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, digest, read_checkpoint, write_checkpoint
 from en4dvar.results.kinds import kind_in, require_result
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
@@ -133,6 +133,11 @@ class Session:
     notices: list[str] = field(default_factory=list)
     begun: bool = False
 
+    @property
+    def fingerprint(self) -> str:
+        """A digest of what decides the numbers, data included."""
+        return digest(self.identity.settings.encode() + repr(self.identity.data).encode())
+
     def earlier(self) -> Identity | None:
         """The identity of the run that is resumed. Raises :class:`CheckpointError`."""
         return read_checkpoint(self.directory.at(IDENTITY), "run", Identity) if self.directory.resumed else None
@@ -175,31 +180,38 @@ class Session:
 
 
 class KeptUnits(Generic[S]):
-    """What is ``done`` of the units of work of a run, in the order of their ends; kept as by :meth:`Session.kept`."""
+    """What is ``done`` of the units of work of a run, by their names, in the order of their ends; kept as by
+    :meth:`Session.kept`.
+    """
 
-    def __init__(self, run: Session, file: str, fingerprint: str, kind: type[S], otherwise: str):
-        kinds: Any = GenericAlias(tuple, (kind, ...))
-        before, self.keeper = run.kept(file, fingerprint, kinds, otherwise)
+    def __init__(self, run: Session, file: str, kind: type[S], otherwise: str):
+        kinds: Any = GenericAlias(tuple, (GenericAlias(tuple, (str, kind)), ...))
+        before, self.keeper = run.kept(file, run.fingerprint, kinds, otherwise)
         self.log = run.log
-        self.done: list[S] = [*(before or ())]
+        self.done: dict[str, S] = dict(before or ())
 
     def work(
-        self, executor: Executor, function: Callable[..., S], calls: Sequence[tuple[Any, ...]], tell: Tell | None,
-        total: int, *, failed: Callable[..., S], line: Callable[[S], str],
-    ) -> None:  # fmt: skip
-        """Do the ``calls`` that are left of a ``total``: ``failed`` makes a unit of a call and the reason why it ended
-        in an error, ``line`` is what the log says of a unit.
+        self, executor: Executor, function: Callable[..., S], calls: Mapping[str, tuple[Any, ...]], tell: Tell | None,
+        *, failed: Callable[..., S], line: Callable[[S], str],
+    ) -> list[S]:  # fmt: skip
+        """The units of ``calls`` (name → arguments), in their order; those that are not done are done: ``failed`` makes
+        a unit of a call and the reason why it ended in an error, ``line`` is what the log says of a unit.
         """
-        for count, (i, ended) in enumerate(executor.map(function, iter(calls)), 1):
-            if isinstance(ended, Exception):
-                reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
-                ended = failed(*calls[i], reason=reason)
-            self.done.append(ended)
-            self.log(line(ended))
-            self.keeper.keep(lambda: tuple(self.done))
-            if tell:
-                tell(total - len(calls) + count, total)
-        self.keeper.write(tuple(self.done))
+        left, tell = [name for name in calls if name not in self.done], tell or (lambda done, total: None)
+        before = len(calls) - len(left)
+        tell(before, len(calls))
+        try:
+            for count, (i, ended) in enumerate(executor.map(function, (calls[name] for name in left)), 1):
+                if isinstance(ended, Exception):
+                    reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
+                    ended = failed(*calls[left[i]], reason=reason)
+                self.done[left[i]] = ended
+                self.log(line(ended))
+                self.keeper.keep(lambda: tuple(self.done.items()))
+                tell(before + count, len(calls))
+        finally:
+            self.keeper.write(tuple(self.done.items()))
+        return [self.done[name] for name in calls]
 
 
 def require_some(units: str, failures: Sequence[str]) -> None:
