@@ -21,8 +21,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.series.moments import Moments, SequentialState
-from en4dvar.series.problem import members_lost, narrowed, too_few
-from en4dvar.series.sequential import run_sequential
+from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
@@ -85,14 +84,11 @@ class Score:
 
 
 @dataclass(frozen=True)
-class TwinResult:
-    """``truth`` (K, n_state) at ``series.times``, the observations and what the assimilation made of them."""
+class TwinResult(SeriesResult):
+    """What the assimilation made of the observations of a ``truth`` (K, n_state) at ``series.times``."""
 
     experiment: TwinExperiment
-    seed: int
     truth: Array
-    series: CycleSeries
-    run: SequentialState
 
     @property
     def scores(self) -> dict[str, Score]:
@@ -105,10 +101,7 @@ class TwinResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the scores mean less than they seem to."""
-        experiment = self.experiment
-        warnings = [*members_lost(self.run, experiment.members)]
-        warnings += too_few(experiment.start, experiment.sequential, experiment.members, experiment.cycles)
-        warnings += narrowed(self.run, experiment.start, experiment.sequential, experiment.cycles)
+        warnings = [*self.of_members]
         fields, prior = self.experiment.model.layout, self.experiment.prior
         names = np.array([f.name for f in fields for _ in range(f.size)])
         hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]
@@ -194,9 +187,6 @@ def conduct(
     Raises TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
     """
     truth, series = observe_truth(experiment, seed)
-    members = experiment.start.members(experiment.members, seed)
-    run = run_sequential(
-        experiment.model, experiment.observables, members, series, experiment.sequential, seed, executor, on_cycle,
-        resume, keep, truth,
-    )  # fmt: skip
-    return TwinResult(experiment, seed, truth, series, run)
+    problem = SeriesProblem(experiment.start, experiment.observables, series, experiment.sequential, experiment.members)
+    result = assimilate_series(problem, seed, executor, on_cycle, resume, keep, truth)
+    return TwinResult(problem, seed, result.run, experiment, truth)

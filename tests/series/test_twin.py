@@ -21,6 +21,7 @@ from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import InnovationRecorder
+from en4dvar.series.problem import SeriesProblem
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import Inflation
@@ -189,8 +190,9 @@ def test_an_ensemble_that_has_lost_the_truth_is_told():
     lost = decay(Named(), initial_std={"x": 1e-6})
     truth, series = observe_truth(lost, 1)
     members = lost.start.members(lost.members, 1) + np.array([0.5, 0.5, 0, 0])
+    problem = SeriesProblem(lost.start, lost.observables, series, lost.sequential, lost.members)
     run = run_sequential(lost.model, lost.observables, members, series, lost.sequential)
-    (warning,) = TwinResult(lost, 1, truth, series, run).warnings
+    (warning,) = TwinResult(problem, 1, run, lost, truth).warnings
     assert "far too sure of itself" in warning
 
 
