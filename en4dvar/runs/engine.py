@@ -25,7 +25,7 @@ from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
 from en4dvar.results.run_results import has_results
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
-from en4dvar.runs.progress import RunLog
+from en4dvar.runs.progress import run_log
 from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
 
 R = TypeVar("R")
@@ -298,12 +298,12 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
             "configuration_resolved": config.resolved,
             "identity": who.settings,
         }
-        with RunLog(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
-            run = Session(config, directory, log.write, who, attributes)
+        with run_log(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
+            run = Session(config, directory, log, who, attributes)
             try:
-                log.write(attributes["history"])
+                log(attributes["history"])
                 yield run
-                log.write("done")
+                log("done")
             except (ExecutorError, OutputError) as error:
                 if isinstance(error, UnguardedError) or not run.begun:
                     raise
