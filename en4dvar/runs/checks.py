@@ -21,6 +21,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.problem import InverseProblem
 from en4dvar.results.variables import require_free_names
+from en4dvar.runs.together import require_population
 
 T = TypeVar("T")
 
@@ -49,6 +50,8 @@ def check_all(
         if isinstance(config, Config):
             files = estimated_files(config)
             problems, unusable = _read_files(document, inverse_plan(config), partial(checked_problem, config))
+            for problem in problems[:1]:
+                require_population(config, problem, files)
             require_counted_once(config, files)
         if isinstance(config, SequenceConfig):
             build_sequence(config)
