@@ -126,12 +126,16 @@ class DesignKind(RunKind[Designs]):
         return needed_file(self.config, _planned_times(self.config))
 
     @cached_property
+    def planned(self) -> Planned:
+        """The design of the file itself. Raises :class:`ConfigError`, :class:`DataError`."""
+        return Planned(planned_problem(self.config), self.config.design.about, self.config.design.common)
+
+    @cached_property
     def asked(self) -> Asked:
         """What is asked. Raises :class:`ConfigError`, :class:`DataError`."""
-        config = self.config
-        problem = planned_problem(config)
+        config, design, planned = self.config, self.config.design, self.planned
+        problem = planned.problem
         terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-        design, planned = config.design, Planned(problem, config.design.about, config.design.common)
         about = [terms[name] for name in planned.about]
         others = [terms[name] for name in planned.names[planned.asked :]] if design.wanted else []
         _wanted(config, problem)
@@ -141,9 +145,9 @@ class DesignKind(RunKind[Designs]):
             symbols=tuple(p.symbol for p in about),
             labels=tuple(p.label for p in about),
             units=tuple((p.unit, p.display_unit) for p in about),
-            knobs=tuple(config.design.knobs),
-            laws=tuple(config.design.laws),
-            enough=config.design.enough,
+            knobs=tuple(design.knobs),
+            laws=tuple(design.laws),
+            enough=design.enough,
             seen=seen.label,
             wanted={name: str(text) for name, text in design.wanted.items()},
             others=tuple((p.name, p.unit, p.display_unit) for p in others),
@@ -202,8 +206,7 @@ class DesignKind(RunKind[Designs]):
     def _cost(self, numbers: Sequence[int], method: Method) -> str:
         """What it takes to evaluate so many designs, in words; they are taken to be as the first."""
         design = self.config.design
-        planned = Planned(planned_problem(self.config), design.about, design.common)
-        runs = span_of_runs(planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
+        runs = span_of_runs(self.planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
         return f"{counted(len(numbers), 'design')} by {method}, about {rounded(*runs)} forward runs each"
 
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
