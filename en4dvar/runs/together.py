@@ -336,11 +336,13 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
         return
     groups = groups_of(config, names)
     count = max((len(group.datasets) for group in groups), default=len(names))
+    alone = "to estimate each without one: --set population=null"
     try:
+        if len(problem.parts) > 1:  # as finished_set, before anything is computed
+            raise ConfigError(f"a population needs data sets of one series each; {alone}")
         if count < FEWEST_SETS:
             where = " in the largest group" if groups else ""
-            words = f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}"
-            raise ConfigError(f"{words}; to estimate each without one: --set population=null")
+            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}; {alone}")
         of_campaign.require_population([problem], config.population.of)
     except ConfigError as error:
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +147,12 @@ def test_what_has_no_population_is_told_before_anything_is_computed(tmp_path, n,
     with pytest.raises(ConfigError, match=words):
         run_campaign(configuration(path, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
+
+
+def test_data_sets_of_several_series_have_none_which_is_told_before_anything_is_computed():
+    path = Path(__file__).resolve().parents[2] / "configs" / "predator_prey.yaml"
+    with pytest.raises(ConfigError, match=r"population: .* of one series each; .*--set population=null"):
+        validate(path, {"population": {"of": ["alpha"]}})
 
 
 @pytest.mark.slow
