@@ -1,6 +1,5 @@
 """What a run tells while it runs: one line an iteration in ``run.log``, a live line on a terminal."""
 
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +16,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.compiled import watch_compilation
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import own_file, refused
-from en4dvar.plumbing.hints import short
+from en4dvar.plumbing.hints import duration, short
 from en4dvar.plumbing.tables import without_control
 from en4dvar.plumbing.units import convert
 from en4dvar.runs.interrupt import Interrupted
@@ -156,11 +155,7 @@ def time_left(gone: float, done: int, total: int, iterations: Sequence[int], len
     work = done + sum(min(0.9, i / max(expected, 1.0)) for i in iterations)
     if gone < 1.0 or work <= 0 or done >= total:
         return ""
-    seconds = gone * (total - work) / work
-    for limit, size, unit in ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (math.inf, 3600.0, "h")):
-        if seconds < limit:
-            return f"about {max(1, round(seconds / size))} {unit} left"
-    return ""
+    return f"about {duration(max(1, round(gone * (total - work) / work)))} left"
 
 
 @contextmanager
