@@ -29,7 +29,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.series.start import EnsembleCoordinates
+from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 from en4dvar.series.twin import TwinExperiment
 
 
@@ -122,18 +122,16 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     prior = Prior(terms) if terms else None
     with document.placing():
         rate = error_rates(model, file.model_error or ())
+    coordinates = EnsembleCoordinates.of(model, prior)
     experiment = TwinExperiment(
-        model=model,
-        sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
+        start=InitialEnsemble(model, twin.initial_std, prior, fixed, coordinates),
+        sequential=file.assimilation.built(local, rate, coordinates),
         members=file.assimilation.members,
         cycles=twin.cycles,
         interval=twin.interval,
         error_std=observed,
-        initial_std=twin.initial_std,
         burn_in=twin.burn_in,
         error_correlation=twin.error_correlation[1] if twin.error_correlation else None,
-        prior=prior,
-        fixed=fixed,
     )
     return TwinConfig(**read.common(()), experiment=experiment, scheme=file.assimilation.scheme)
 

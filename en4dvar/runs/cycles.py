@@ -157,7 +157,7 @@ class TwinKind(Cycles[TwinOutcome]):
         )
         every = f"{counted(twin.cycles, 'cycle')} every {twin.interval:g}{unit_after(self.config.model.time_unit)}"
         told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
-        return "twin experiment", twin.prior, twin.members, told
+        return "twin experiment", twin.start.prior, twin.members, told
 
 
 class SequenceKind(Cycles[SequenceOutcome]):
