@@ -255,7 +255,6 @@ class Worklist:
     def recall(self) -> None:
         """Take over what an earlier run finished, by its checksums; what failed or cannot be trusted is done again."""
         finished = not self.alone and self.run.directory.at("posterior.nc").exists()
-        left = {f"{FOLDER}/{path.name}" for path in self.run.directory.at(FOLDER).iterdir()}
         for d in self.sets:
             entry = self.pack.entries.get(d.stem)
             if entry is None and finished:
@@ -275,8 +274,7 @@ class Worklist:
                 self.estimate_again([d.name])
                 continue
             self.ended[d.name] = None
-            if d.iteration in left:  # of a run killed between its last two steps
-                self.run.directory.remove(d.iteration)
+            remove_file(self._checkpoint(d))  # of a run killed between its last two steps
         self.run.log(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
 
     def estimate_again(self, names: Sequence[str]) -> None:
@@ -390,7 +388,7 @@ class Worklist:
         self.run.log(f"{d.name}: failed: {reason}")
         if not known:
             self.run.log("".join(traceback.format_exception(error)))
-        if len(self.sets) == 1:
+        if self.alone:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
         failed = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)
