@@ -346,12 +346,12 @@ class PoolExecutor(FuturesExecutor):
         What is left alone is waited for :data:`PATIENCE` seconds, and ends this process no later than itself; the
         command line does not wait for it (:func:`en4dvar.cli.main`).
         """
-        pool, self._pool = self._pool, None
-        if pool is None:
+        if (pool := self._pool) is None:
             return
-        pool.shutdown(wait=False, cancel_futures=True)
         threads = {thread.ident: thread for thread in pool._threads if thread.ident is not None}
         end_those_of(threads)
+        self._pool = None  # from here on they stop, also where another Ctrl-C comes
+        pool.shutdown(wait=False, cancel_futures=True)
         _join(threads.values(), MOMENT)
         for number in [number for number, thread in threads.items() if thread.is_alive()]:
             raise_in(number, HaltedError)

@@ -113,9 +113,6 @@ class RunKind(Kind, ABC, Generic[R]):
         Raises :class:`OutputError` and what the computation raises.
         """
 
-    def stop(self) -> None:
-        """End what computes in threads of this process."""
-
 
 @dataclass
 class Session:
@@ -245,7 +242,6 @@ def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, com
                     kind.page(directory.work, figures=kind.config.figures)
                 return result
             except BaseException:  # no worker writes once the directory is free for others
-                kind.stop()
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
                     executor.kill()
                 raise

@@ -159,10 +159,6 @@ class EstimateKind(RunKind[Campaign]):
             work.summarise()
         return work.campaign()
 
-    def stop(self) -> None:
-        if self.work:
-            self.work.stop.set()
-
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report import write_pages  # what draws pages is slow to import
