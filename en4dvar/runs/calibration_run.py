@@ -125,7 +125,7 @@ class CalibrationKind(RunKind[Calibration]):
         told = kept.work(
             executor, _judged, calls, self.progress,
             failed=lambda _, number, reason: Judged(number, names[(number - 1) % len(names)], failure=reason),
-            line=lambda judged: f"set {judged.number}: {judged.failure or 'estimated'}",
+            line=lambda name, judged: f"{name}: {judged.failure or 'estimated'}",
         )  # fmt: skip
         require_some("sets", [judged.failure for judged in told])
         name, file = next(iter(self.data.items()))

@@ -212,7 +212,7 @@ class DesignKind(RunKind[Designs]):
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
         calls = {f"{method} {n}": (n, self.every[n], method, self.config.seed) for n in numbers}
         kept.work(
-            executor, _one, calls, self.tell, line=_line,
+            executor, _one, calls, self.tell, line=lambda _, done: _line(done),
             failed=lambda number, *_, reason: Done(number, method, (), reason),
         )  # fmt: skip
         every = list(kept.done.values())

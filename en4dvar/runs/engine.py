@@ -189,10 +189,10 @@ class KeptUnits(Generic[S]):
 
     def work(
         self, executor: Executor, function: Callable[..., S], calls: Mapping[str, tuple[Any, ...]], tell: Tell | None,
-        *, failed: Callable[..., S], line: Callable[[S], str],
+        *, failed: Callable[..., S], line: Callable[[str, S], str],
     ) -> list[S]:  # fmt: skip
         """The units of ``calls`` (name → arguments), in their order; those that are not done are done: ``failed`` makes
-        a unit of a call and the reason why it ended in an error, ``line`` is what the log says of a unit.
+        a unit of a call and the reason why it ended in an error, ``line`` is what the log says of one, by its name.
         """
         left, tell = [name for name in calls if name not in self.done], tell or (lambda done, total: None)
         before = len(calls) - len(left)
@@ -203,7 +203,7 @@ class KeptUnits(Generic[S]):
                     reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
                     ended = failed(*calls[left[i]], reason=reason)
                 self.done[left[i]] = ended
-                self.log(line(ended))
+                self.log(line(left[i], ended))
                 self.keeper.keep(lambda: tuple(self.done.items()))
                 tell(before + count, len(calls))
         finally:

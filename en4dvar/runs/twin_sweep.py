@@ -70,7 +70,7 @@ class TwinSweep:
         for values, runs in zip(self.values, self.runs, strict=True):
             for seed, run in zip(self.seeds, runs, strict=True):
                 for words in run.warnings:
-                    line = f"{', '.join(map(_text, values))}, seed {seed}: {words}"
+                    line = f"{_words(values)}, seed {seed}: {words}"
                     told.setdefault(words.rpartition("; ")[2], []).append(line)
         total = len(self.values) * len(self.seeds)
         return (f"{len(lines)} of {total} runs, the first is {lines[0]}" for lines in told.values())
@@ -86,7 +86,7 @@ class TwinSweep:
 
     def plot(self) -> "Figure":
         """RMSE of each estimate, with its standard error, over the settings."""
-        names = [", ".join(map(_text, values)) for values in self.values]
+        names = [*map(_words, self.values)]
         panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)
         for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):
             at = [i for i, runs in enumerate(self.runs) if estimate in averages(runs)]
@@ -198,11 +198,13 @@ class SweepKind(RunKind[TwinSweep]):
         settings = [(c.experiment, identity(c.resolved, c.experiment.model, {}).settings) for c in self.configs]
         jobs = [(experiment, seed) for experiment, _ in settings for seed in self.seeds]
         marks = [digest(f"{text}\nseed of the run: {seed}".encode()) for _, text in settings for seed in self.seeds]
+        words = [f"{_words(values)}, seed {seed}" for values in self.values for seed in self.seeds]
+        named = dict(zip(marks, words, strict=True))
         kept = KeptUnits(session, STATE, TwinRun, "all runs are conducted again")
         kept.work(
             executor, _one, dict(zip(marks, jobs, strict=True)), self.progress,
             failed=lambda *_, reason: TwinRun(failure=readable(reason)),
-            line=lambda run: run.failure or "; ".join(f"{name}: RMSE {rmse:.4g}" for name, rmse, _ in run.scores),
+            line=lambda mark, run: f"{named[mark]}: {run.failure or 'done'}",
         )  # fmt: skip
         return [kept.done[mark] for mark in marks]
 
@@ -239,6 +241,10 @@ def runs_table(sweep: TwinSweep) -> Iterator[list[str]]:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else repr(value)
+
+
+def _words(values: Sequence[Any]) -> str:
+    return ", ".join(map(_text, values))
 
 
 def _with_error(value: float, error: float) -> str:

@@ -95,6 +95,7 @@ def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch, kind):
         (2, 1), (0, 3), (2, 1), (0, 3)
     ]  # fmt: skip
     assert "all are lost" in (tmp_path / "a" / "runs.csv").read_text()
+    assert "esrf, 1.0, seed 5: " in (tmp_path / "a" / "run.log").read_text()
     assert "2 (1 failed)" in str(found)
 
 
