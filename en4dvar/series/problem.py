@@ -205,8 +205,9 @@ def assimilate_series(
 ) -> SeriesResult:
     """Assimilate a series of observations. The same seed gives the same bits for any executor.
 
-    ``on_cycle``, ``resume``, ``keep`` and ``truth`` as for :func:`~en4dvar.series.sequential.run_sequential`, its
-    errors too; members of a twin experiment are independent draws, as the truth is.
+    ``on_cycle``, ``resume``, ``keep`` and ``truth`` (K, n_state) as for
+    :func:`~en4dvar.series.sequential.run_sequential`, its errors too; members of a twin experiment are independent
+    draws, as the truth is.
     """
     members = problem.start.members(problem.members, seed, exact=truth is None)
     run = run_sequential(
