@@ -54,10 +54,7 @@ class _Worker:
         Raises :class:`_DeadError`.
         """
         while True:
-            try:
-                content = memoryview(self.pipe.recv_bytes())
-            except (EOFError, OSError):
-                raise _DeadError from None
+            content = memoryview(self.receive())
             try:
                 value = pickle.loads(content[1:])
             except BaseException as error:  # a value that cannot be made again here
@@ -66,6 +63,13 @@ class _Worker:
                 return value
             if tell:
                 tell(value)
+
+    def receive(self) -> bytes:
+        """The next message, whole. Raises :class:`_DeadError`."""
+        try:
+            return self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise _DeadError from None
 
     def end(self) -> None:
         self.pipe.close()  # the sign for a worker to end
