@@ -279,14 +279,13 @@ def build_sequence(config: SequenceConfig) -> SeriesProblem:
 
 def _localisation(config: SequenceConfig, asked: SeriesLocalisation, problem: SeriesProblem) -> BlockLocalisation:
     """By the distance between cells of the field and the places that were read. Raises :class:`ConfigError`."""
-    operators = [read.operator for read in problem.observables]
+    read = [o.operator.places for o in problem.observables if isinstance(o.operator, AtPlaces)]
     with config.document.placing("assimilation", "localisation"):
         if problem.series.correlation is not None:
             raise ConfigError("needs observations with independent errors")
-        if not all(isinstance(operator, AtPlaces) for operator in operators):
+        if len(read) < len(problem.observables):
             raise ConfigError("needs readings of a field: data.places")
-        places = [operator.places for operator in operators if isinstance(operator, AtPlaces)]
-        cells = np.concatenate([np.sum(at.indices * at.shares, axis=1) for at in places])
+        cells = np.concatenate([np.sum(at.indices * at.shares, axis=1) for at in read])
         return localisation_of(asked, config.model, {series.observable.name for series in config.data.series}, cells)
 
 

@@ -28,7 +28,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import PathError, expanded, open_plain, readable
 from en4dvar.plumbing.hints import free_name, natural
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 
 LONGEST_HEAD = 4096  # bytes of a line of names
 
@@ -156,7 +156,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         clock = data.columns.time
         early, unit = -times[0], ""
         if isinstance(clock, Column):
-            early, unit = convert(early, clock.target, clock.unit), "" if clock.unit == "1" else f" {clock.unit}"
+            early, unit = convert(early, clock.target, clock.unit), unit_after(clock.unit)
         words = f"the first observation used lies {early:g}{unit} before time zero, where the model's clock starts"
         raise DataError(f"{path}: {words}; put it earlier (data.time_zero), or begin later (data.window.from)")
 

@@ -219,14 +219,6 @@ def command_line(without: tuple[str, ...] = (), also: tuple[str, ...] = ()) -> s
     return shlex.join(["en4dvar", *(word for word in sys.argv[1:] if word not in without), *also])
 
 
-def note_beginning(run_dir: Path | None, resume: bool) -> None:
-    """Say that there is nothing to resume, as for a batch job that was killed before it began."""
-    from en4dvar.runs.rundir import holds_run
-
-    if run_dir is not None and resume and not holds_run(run_dir):
-        tell(f"note: {run_dir} holds no run yet; this one begins")
-
-
 def to_continue(kept: object) -> Failed:
     """The last words of a command that was stopped: what is kept of its run, if one has begun, and what to type."""
     again = command_line(without=("--force", "--resume"), also=("--resume",))
@@ -237,8 +229,10 @@ def to_continue(kept: object) -> Failed:
 def continuable(run_dir: Path | None = None, resume: bool = False) -> Iterator[str]:
     """Within, an interrupt says what is kept of the run and what to type next; gives the command as typed."""
     from en4dvar.runs.interrupt import begun
+    from en4dvar.runs.rundir import holds_run
 
-    note_beginning(run_dir, resume)
+    if run_dir is not None and resume and not holds_run(run_dir):  # of a batch job that was killed before it began
+        tell(f"note: {run_dir} holds no run yet; this one begins")
     try:
         yield command_line()
     except KeyboardInterrupt as interrupt:

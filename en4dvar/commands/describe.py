@@ -9,7 +9,7 @@ from en4dvar.config import Config
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
 from en4dvar.model.state import Parameter
-from en4dvar.plumbing.hints import counted, rounded
+from en4dvar.plumbing.hints import counted, duration, rounded
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.field_prior import FieldPrior
@@ -88,17 +88,9 @@ def cost_summary(config: Config, preview: Preview, count: int) -> str:
         return " to ".join(dict.fromkeys(words(runs * times) for runs in (least, most)))
 
     a_set, in_all = (" a data set", f"; in all {span(rounded, count)},") if count > 1 else ("", ":")
-    runs = f"about {span(rounded, 1)} forward runs{a_set}, {_seconds(preview.seconds)} each{in_all}"
-    took = f"{span(_seconds, count * preview.seconds)} on one thread"
+    runs = f"about {span(rounded, 1)} forward runs{a_set}, {duration(preview.seconds)} each{in_all}"
+    took = f"{span(duration, count * preview.seconds)} on one thread"
     return f"cost: {runs} {took}, plus up to some seconds a data set for all else{more}"
-
-
-def _seconds(value: float) -> str:
-    """A duration as people say it, to two digits."""
-    for limit, unit, size in ((1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)):
-        if value < limit:
-            return f"{float(f'{value / size:.2g}'):g} {unit}"
-    return f"{value / 3600:.2g} h"
 
 
 def _series_row(problem: InverseProblem, part: Part) -> tuple[str, ...]:

@@ -54,17 +54,13 @@ def loaded(entry: EntryPoint, what: str) -> Any:
         return entry.load()
 
 
+@cache
 def about(entry: EntryPoint) -> str:
     """First sentence of the function's docstring, read without importing; its package where that cannot be found."""
-    return _first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
-
-
-@cache
-def _first_sentence(entry: EntryPoint) -> str:
     top, *rest = entry.module.split(".")
-    spec = find_spec(top)
+    spec, unknown = find_spec(top), f"From {top}."
     if spec is None or spec.origin is None:
-        return ""
+        return unknown
     base = Path(spec.origin).parent.joinpath(*rest)
     files = (base.with_suffix(".py"), base / "__init__.py") if rest else (Path(spec.origin),)
     try:
@@ -72,8 +68,8 @@ def _first_sentence(entry: EntryPoint) -> str:
         functions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
         help_text = next(ast.get_docstring(f) or "" for f in functions if f.name == entry.attr)
     except (OSError, ValueError, SyntaxError, StopIteration):
-        return ""
-    return " ".join(help_text.partition("\n\n")[0].split())
+        return unknown
+    return " ".join(help_text.partition("\n\n")[0].split()) or unknown
 
 
 class WithForms(click.Command):

@@ -183,15 +183,13 @@ class _Warnings:
 
 def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> None:
     """Cycles, their table on standard output, warnings on standard error, and where the files are."""
-    from en4dvar.config import TwinConfig
-    from en4dvar.runs.cycles import cycles_of, run_sequence, run_twin
+    from en4dvar.runs.cycles import cycles_of
+    from en4dvar.runs.engine import conduct_run
     from en4dvar.runs.progress import counted
 
-    kind = cycles_of(config)
-    conduct: Any = run_twin if isinstance(config, TwinConfig) else run_sequence
     with continuable(config.directory, resume) as command, counted("cycles") as tell:
-        on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
-        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command)
+        kind = cycles_of(config, lambda cycle: tell(cycle + 1, kind.cycles) if tell else None)
+        result = conduct_run(kind, force, resume, command)
     echo(result.table())
     for warning in result.warnings:
         echo(f"warning: {config.name}: {warning}", err=True)

@@ -131,7 +131,7 @@ def design(source: Source, **how: Any) -> None:
     from en4dvar.runs.design_run import run_design
     from en4dvar.runs.progress import counted
 
-    with continuable() as command, counted("designs") as on_design:
+    with continuable(how["out"], how["resume"]) as command, counted("designs") as on_design:
         plan, directory = run_design(
             source.path, overrides=source.overrides(), on_design=on_design, on_cost=tell, command=command, **how
         )

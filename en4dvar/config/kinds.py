@@ -31,7 +31,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.series.start import EnsembleCoordinates
+from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 from en4dvar.series.twin import TwinExperiment
 
 
@@ -114,18 +114,16 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     if twin.error_correlation:
         with document.placing("twin", "error_correlation"), retold((DataError, ValueError), ConfigError):
             correlation = Correlation(read_covariance(Matrix(twin.error_correlation, "1", "1")))
+    coordinates = EnsembleCoordinates.of(model, prior)
     experiment = TwinExperiment(
-        model=model,
-        sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
+        start=InitialEnsemble(model, twin.initial_std, prior, fixed, coordinates),
+        sequential=file.assimilation.built(local, rate, coordinates),
         members=file.assimilation.members,
         cycles=twin.cycles,
         interval=twin.interval,
         error_std=observed,
-        initial_std=twin.initial_std,
         burn_in=twin.burn_in,
         error_correlation=correlation,
-        prior=prior,
-        fixed=fixed,
     )
     return read.validated(TwinConfig, experiment=experiment, scheme=file.assimilation.scheme)
 

@@ -22,6 +22,7 @@ from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.units import unit_after
 from en4dvar.plumbing.user_code import describe, loss_of, own_fault, reason_of
 
 T = TypeVar("T")
@@ -113,7 +114,7 @@ def _own(model: ForwardModel, outcome: Outcome, asked: Array) -> Outcome:
     off = _off(stated, asked, model._begins)
     if not off.any():
         return outcome
-    unit = "" if model.time_unit == "1" else f" {model.time_unit}"
+    unit = unit_after(model.time_unit)
     odd, at = (
         f"{counted(len(t), 'time')} from {t[0]:.6g} to {t[-1]:.6g}{unit}" if len(t) else "no times"
         for t in (stated, asked)
@@ -345,12 +346,12 @@ class PoolExecutor(FuturesExecutor):
         What is left alone is waited for :data:`PATIENCE` seconds, and ends this process no later than itself; the
         command line does not wait for it (:func:`en4dvar.cli.main`).
         """
-        pool, self._pool = self._pool, None
-        if pool is None:
+        if (pool := self._pool) is None:
             return
-        pool.shutdown(wait=False, cancel_futures=True)
         threads = {thread.ident: thread for thread in pool._threads if thread.ident is not None}
         end_those_of(threads)
+        self._pool = None  # from here on they stop, also where another Ctrl-C comes
+        pool.shutdown(wait=False, cancel_futures=True)
         _join(threads.values(), MOMENT)
         for number in [number for number, thread in threads.items() if thread.is_alive()]:
             raise_in(number, HaltedError)

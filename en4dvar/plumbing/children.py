@@ -34,7 +34,7 @@ MARK = "EN4DVAR_STARTED_BY"
 _BORN = secrets.token_hex(8)
 PATIENCE = 1.0  # s for processes to be gone that were killed
 _children: "dict[int, Child]" = {}  # thread → what it waits for
-_stopped: set[int] = set()  # threads that start no child any more
+_stopped: set[int] = set()  # threads that start no child and no forecast any more
 _changing = threading.Lock()
 
 

@@ -68,6 +68,14 @@ def rounded(*counts: float) -> str:
     return " to ".join(dict.fromkeys(f"{float(f'{count:.2g}'):.0f}" for count in counts))
 
 
+def duration(seconds: float) -> str:
+    """A time as people say it, to two digits."""
+    for limit, unit, size in ((1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)):
+        if seconds < limit:
+            return f"{float(f'{seconds / size:.2g}'):g} {unit}"
+    return f"{seconds / 3600:.2g} h"
+
+
 def percent(share: float) -> str:
     """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
     return f"{100 * share:z.0f} %".replace("-", "−") if math.isfinite(share) else "–"

@@ -14,7 +14,6 @@ import hashlib
 import json
 import math
 import struct
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
@@ -28,6 +27,7 @@ from en4dvar.diagnosis.analysis import Progress
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
+from en4dvar.plumbing.children import require_going_on
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import atomic_path, open_plain, read_at_most
 
@@ -189,31 +189,23 @@ class KnownRuns:
     forecasts: tuple[Forecast, ...] = ()
 
 
-class StoppedError(Exception):
-    """The data set was given up."""
-
-
 class Journal(Executor):
     """An ``executor`` of forward runs that are not made where they are known from ``before``. ``keeper`` writes them to
-    a file, where its folder is seen. ``stop`` gives the data set up at its next forecast (in one process only).
+    a file, where its folder is seen. In a thread that is to stop the next one raises :class:`HaltedError`.
     """
 
-    def __init__(
-        self, executor: Executor, before: KnownRuns = KnownRuns(), keeper: Keeper | None = None,
-        stop: threading.Event | None = None,
-    ):  # fmt: skip
+    def __init__(self, executor: Executor, before: KnownRuns = KnownRuns(), keeper: Keeper | None = None):
         self.executor, self.workers, self.reads = executor, executor.workers, executor.reads
         self.keys, self.forecasts, self.at = list(before.keys), list(before.forecasts), 0
         self.room = LARGEST - sum(run.nbytes for run in before.forecasts)
-        self.keeper, self.stop = keeper, stop
+        self.keeper = keeper
 
     def untold(self, progress: Progress | None) -> Progress | None:
         """What hears of what follows from the last run that is known on: the rest was told before the interruption."""
         return progress and (lambda name, record: progress(name, record) if self.at >= len(self.keys) else None)
 
     def once(self, run: Callable[..., Any], *asked: Array) -> Any:
-        if self.stop is not None and self.stop.is_set():
-            raise StoppedError
+        require_going_on()
         at, key = self.at, digest(b"".join(part.tobytes() for part in asked))
         self.at += 1
         if at < len(self.keys) and self.keys[at] == key:

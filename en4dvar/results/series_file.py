@@ -13,7 +13,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
 from en4dvar.results.netcdf import Group, netcdf_attributes
 from en4dvar.series.moments import SequentialState
-from en4dvar.series.problem import SeriesProblem, SeriesResult, normalised_innovations
+from en4dvar.series.problem import SeriesProblem, SeriesResult
 from en4dvar.series.twin import TwinResult
 
 FILES = ("twin.nc", "sequence.nc")
@@ -26,7 +26,7 @@ def series_file(run_dir: Path) -> Path | None:
     return next((run_dir / name for name in FILES if (run_dir / name).is_file()), None)
 
 
-def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:
+def series_group(result: SeriesResult, attributes: Mapping[str, Any]) -> Group:
     """Estimates, observations and innovations in time; members of a sequence, truth and scores of a twin experiment."""
     file = "twin.nc" if isinstance(result, TwinResult) else "sequence.nc"
     root = netcdf_attributes({**attributes_of(ATTRIBUTES[file], result), **attributes})
@@ -36,24 +36,15 @@ def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any
 # What is common to both
 
 
-def _model(r: SeriesResult | TwinResult) -> ForwardModel:
-    return r.experiment.model if isinstance(r, TwinResult) else r.problem.start.model
-
-
-def _series(r: Any) -> Any:
-    return r.series if isinstance(r, TwinResult) else r.problem.series
-
-
 def _states(r: Any) -> list[tuple[str, str]]:
     """Name and unit of the variables of the state."""
-    return [(f"{f.name}_{j}" if f.size > 1 else f.name, f.unit) for f in _model(r).layout for j in range(f.size)]
+    return [(f"{f.name}_{j}" if f.size > 1 else f.name, f.unit) for f in r.model.layout for j in range(f.size)]
 
 
 def _kinds(r: Any) -> Iterator[Item]:
     kinds = {"forecast": r.run.forecast, "analysis": r.run.analysis, "smoothed": r.run.smoothed}
-    smooths = "smoothed" in r.scores if isinstance(r, TwinResult) else r.problem.settings.smooths
     for kind, moments in kinds.items():
-        if kind != "smoothed" or smooths:
+        if kind != "smoothed" or r.problem.settings.smooths:
             yield Item(moments, {"kind": kind}, kind)
 
 
@@ -61,21 +52,21 @@ SCOPES = {"kind": _kinds}
 BARE = UnitRule("its own: coordinate `units`", lambda _, item: {}, ())
 READ = UnitRule("its own: of a sequence coordinate `observation_units`", BARE.attributes, ())
 NAME = UnitRule("", BARE.attributes, ())
-EACH = When("errors that differ in time", lambda r, _: _series(r).std.ndim == 2)
-ALIKE = When("errors that do not", lambda r, _: _series(r).std.ndim == 1)
-CORRELATED = When("correlated errors", lambda r, _: _series(r).correlation is not None)
+EACH = When("errors that differ in time", lambda r, _: r.series.std.ndim == 2)
+ALIKE = When("errors that do not", lambda r, _: r.series.std.ndim == 1)
+CORRELATED = When("correlated errors", lambda r, _: r.series.correlation is not None)
 WEIGHTED = When("a particle filter", lambda r, _: bool(np.isfinite(r.run.effective).any()))
 
 SERIES: Table = (
-    Declared("observations", OBSERVATION, "observations", lambda r: _series(r).values, READ),
-    Declared("observation_std", OBSERVATION, "std of the observation errors", lambda r: _series(r).std, READ, EACH),
-    Declared("observation_std", "observation", "std of the observation errors", lambda r: _series(r).std, READ, ALIKE),
+    Declared("observations", OBSERVATION, "observations", lambda r: r.series.values, READ),
+    Declared("observation_std", OBSERVATION, "std of the observation errors", lambda r: r.series.std, READ, EACH),
+    Declared("observation_std", "observation", "std of the observation errors", lambda r: r.series.std, READ, ALIKE),
     Declared("observation_correlation", "observation observation_column", "correlation of the observation errors",
-             lambda r: _series(r).correlation.matrix, when=CORRELATED),
+             lambda r: r.series.correlation.matrix, when=CORRELATED),
     Declared("predicted_mean", OBSERVATION, "forecast of the observation", lambda r: r.run.predicted.mean, READ),
     Declared("predicted_std", OBSERVATION, "standard deviation of that forecast", lambda r: r.run.predicted.std, READ),
     Declared("normalised_innovation", OBSERVATION, "innovation over its expected standard deviation",
-             lambda r: normalised_innovations(_series(r), r.run)),
+             lambda r: r.normalised),
     Declared("rank", OBSERVATION, "place of the observation among forecast members, observation errors added, 0 to 1",
              lambda r: r.run.ranks),
 )  # fmt: skip
@@ -110,16 +101,16 @@ STATE_COORDINATES: Table = (
 
 # Of data
 
-MODEL_TIME = UnitRule("time of the model", lambda r, _: {"units": _model(r).time_unit})
+MODEL_TIME = UnitRule("time of the model", lambda r, _: {"units": r.model.time_unit})
 CLOCK = UnitRule(
-    MODEL_TIME.words, lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}
+    MODEL_TIME.words, lambda r, _: {"units": r.model.time_unit, "display_units": r.model.time_display_unit}
 )
 
 
 def _columns(r: SeriesResult) -> list[Observable]:
     """The observable of each column of the readings; of a field the place stands behind its name."""
     named = {observable.name: observable for observable in r.problem.observables}
-    return [named[name.split(" at ")[0]] for name in r.problem.series.names]
+    return [named[name.split(" at ")[0]] for name in r.series.names]
 
 
 def _state_read(observable: Observable, model: ForwardModel) -> str:
@@ -132,7 +123,7 @@ def _state_read(observable: Observable, model: ForwardModel) -> str:
 def _states_shown(r: SeriesResult) -> list[Shown]:
     """What says how each variable of the state is shown: the observable that reads it, a parameter, its field of the
     state, or its name."""
-    model = r.problem.start.model
+    model = r.model
     known: dict[str, Shown] = {shown.name: shown for shown in (*model.layout.fields, *model.parameters)}
     known |= {_state_read(o, model): o for o in _columns(r)}
     return [known.get(name) or Field(name, unit=unit) for name, unit in _states(r)]
@@ -160,22 +151,22 @@ SEQUENCE: Table = (
              lambda r: _members(r.run, r.problem.members), BARE),
 )  # fmt: skip
 SEQUENCE_COORDINATES: Table = (
-    _coordinate("time", "time", "observation time", lambda r: r.problem.series.times, CLOCK),
+    _coordinate("time", "time", "observation time", lambda r: r.series.times, CLOCK),
     *STATE_COORDINATES,
     _coordinate("display_units", "state", "unit of the variable in reports",
                 lambda r: text(s.display_unit for s in _states_shown(r))),
     _coordinate("symbol", "state", "how the variable is written in reports",
                 lambda r: text(s.symbol for s in _states_shown(r))),
     _coordinate("positive", "state", "1: the ensemble holds its logarithm", lambda r: _positive(r.problem)),
-    _coordinate("observation", "observation", "what was observed", lambda r: text(r.problem.series.names)),
+    _coordinate("observation", "observation", "what was observed", lambda r: text(r.series.names)),
     _coordinate("observation_units", "observation", "unit of the observation",
                 lambda r: text(o.unit for o in _columns(r))),
     _coordinate("observation_display_units", "observation", "unit of the observation in reports",
                 lambda r: text(o.display_unit for o in _columns(r))),
     _coordinate("observation_state", "observation", "variable of the state that was observed",
-                lambda r: text(_state_read(o, _model(r)) for o in _columns(r))),
+                lambda r: text(_state_read(o, r.model) for o in _columns(r))),
     _coordinate("member_time", "member_time", "times of the members that are kept",
-                lambda r: r.problem.series.times[[k for k, _ in r.run.kept]], MODEL_TIME),
+                lambda r: r.series.times[[k for k, _ in r.run.kept]], MODEL_TIME),
 )  # fmt: skip
 SEQUENCE_ATTRIBUTES = (
     Attribute("title", "what the file is", lambda r: "Sequential assimilation of a series"),

@@ -33,7 +33,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import ERRORS, FIT, LEVELS, Calibration, Judged, load_calibration, write_sets
-from en4dvar.results.checkpoint import FOLDER, digest
+from en4dvar.results.checkpoint import FOLDER
 from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run, require_some
 
 STATE = f"{FOLDER}/calibration"
@@ -119,17 +119,14 @@ class CalibrationKind(RunKind[Calibration]):
                 raise DataError(f"{name}: the readings that are made are not at the times of those that are estimated")
 
     def conduct(self, run: Session, executor: Executor) -> Calibration:
-        fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())
-        kept = KeptUnits(run, STATE, fingerprint, Judged, "all sets are estimated again")
-        known = {judged.number for judged in kept.done}
+        kept = KeptUnits(run, STATE, Judged, "all sets are estimated again")
         common, names = CommonValue((self.config, self.made, list(self.data.items()))), list(self.data)
-        calls = [(common, number) for number in range(1, self.sets + 1) if number not in known]
-        kept.work(
-            executor, _judged, calls, self.progress, self.sets,
+        calls = {f"set {number}": (common, number) for number in range(1, self.sets + 1)}
+        told = kept.work(
+            executor, _judged, calls, self.progress,
             failed=lambda _, number, reason: Judged(number, names[(number - 1) % len(names)], failure=reason),
-            line=lambda judged: f"set {judged.number}: {judged.failure or 'estimated'}",
+            line=lambda name, judged: f"{name}: {judged.failure or 'estimated'}",
         )  # fmt: skip
-        told = sorted((judged for judged in kept.done if judged.number <= self.sets), key=lambda judged: judged.number)
         require_some("sets", [judged.failure for judged in told])
         name, file = next(iter(self.data.items()))
         estimated = build_one(self.config, name, file).prior.parameters

@@ -21,6 +21,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.problem import InverseProblem
 from en4dvar.results.variables import require_free_names
+from en4dvar.runs.together import require_population
 
 T = TypeVar("T")
 
@@ -49,7 +50,8 @@ def check_all(
         if isinstance(config, Config):
             files = estimated_files(config)
             problems, unusable = _read_files(document, inverse_plan(config), partial(checked_problem, config))
-            require_counted_once(config, files)
+            for problem in problems[:1]:
+                require_together(config, problem, files)
         if isinstance(config, SequenceConfig):
             build_sequence(config)
     if faults or (unusable and not problems):
@@ -59,14 +61,18 @@ def check_all(
 
 def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one data set, whose result can be written. Raises :class:`ConfigError`, `DataError`."""
-    config.sharing.of_dataset(name)
     problem = build_one(config, name, file)
     require_free_names(problem)
     return problem
 
 
-def require_counted_once(config: Config, files: Mapping[str, DataFile]) -> None:
-    """Raise :class:`ConfigError` where data sets are estimated together and two hold the same readings."""
+def require_together(config: Config, problem: InverseProblem, files: Mapping[str, DataFile]) -> None:
+    """Raise :class:`ConfigError` where data ``files``, such as that of ``problem``, are to be estimated together, and
+    cannot be: one is in no group, they have no population, two hold the same readings.
+    """
+    for name in files:
+        config.sharing.of_dataset(name)
+    require_population(config, problem, files)
     if not (config.sharing.kinds or config.population):
         return
     usable: list[Observations] = []

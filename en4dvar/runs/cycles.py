@@ -20,16 +20,16 @@ from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import unit_after
 from en4dvar.report.sequence import SequenceOutcome, TwinOutcome
-from en4dvar.results.checkpoint import FOLDER, digest
+from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
 from en4dvar.series.moments import SequentialState
-from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
-from en4dvar.series.twin import TwinResult, conduct
+from en4dvar.series.problem import SeriesProblem, assimilate_series
+from en4dvar.series.twin import conduct
 
 Keep = Callable[[Callable[[], SequentialState]], None]
-R = TypeVar("R", SeriesResult, TwinResult)
+R = TypeVar("R", SequenceOutcome, TwinOutcome)
 
 
 def run_twin(
@@ -46,8 +46,7 @@ def run_twin(
 
     Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
-    kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)
-    return TwinOutcome(**vars(conduct_run(kind, force, resume, command)))
+    return conduct_run(TwinKind(loaded(config, load_twin, overrides), on_cycle), force, resume, command)
 
 
 def run_sequence(
@@ -65,8 +64,7 @@ def run_sequence(
 
     Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
-    kind = SequenceKind(loaded(config, load_sequence, overrides), on_cycle)
-    return SequenceOutcome(**vars(conduct_run(kind, force, resume, command)))
+    return conduct_run(SequenceKind(loaded(config, load_sequence, overrides), on_cycle), force, resume, command)
 
 
 @dataclass(frozen=True)
@@ -116,10 +114,9 @@ class Cycles(RunKind[R]):
 
     def conduct(self, run: Session, executor: Executor) -> R:
         file = f"{FOLDER}/{self.name}.cycle"
-        fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
-        before, keeper = run.kept(file, fingerprint, SequentialState, "it is assimilated from the start")
+        before, keeper = run.kept(file, run.fingerprint, SequentialState, "it is assimilated from the start")
         if before is not None:
-            run.log.write(f"continued after {before.cycle} of {self.cycles} cycles")
+            run.log(f"continued after {before.cycle} of {self.cycles} cycles")
         latest: list[Callable[[], SequentialState]] = []
 
         def keep(state: Callable[[], SequentialState]) -> None:
@@ -129,14 +126,14 @@ class Cycles(RunKind[R]):
         result = self.assimilated(executor, before, keep)
         for state in latest:  # what it ends with is kept, too, so that it is never repeated
             keeper.write(state())
-        run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
+        run.log("\n".join(f"member lost: {reason}" for reason in result.run.failures))
+        own = {"name": self.config.name, "scheme": self.config.scheme}
         to_bytes({"/": series_group(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))
         return result
 
 
-class TwinKind(Cycles[TwinResult]):
+class TwinKind(Cycles[TwinOutcome]):
     """A configuration with a ``twin:`` section."""
 
     name = "twin"
@@ -149,8 +146,9 @@ class TwinKind(Cycles[TwinResult]):
     def cycles(self) -> int:
         return int(self.config.experiment.cycles)
 
-    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
-        return conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinOutcome:
+        result = conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+        return TwinOutcome(**vars(result))
 
     def _described(self) -> tuple[str, Any, int, str]:
         twin = self.config.experiment
@@ -159,10 +157,10 @@ class TwinKind(Cycles[TwinResult]):
         )
         every = f"{counted(twin.cycles, 'cycle')} every {twin.interval:g}{unit_after(self.config.model.time_unit)}"
         told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
-        return "twin experiment", twin.prior, twin.members, told
+        return "twin experiment", twin.start.prior, twin.members, told
 
 
-class SequenceKind(Cycles[SeriesResult]):
+class SequenceKind(Cycles[SequenceOutcome]):
     """A configuration with a ``sequence:`` section."""
 
     name = "sequence"
@@ -187,8 +185,9 @@ class SequenceKind(Cycles[SeriesResult]):
     def cycles(self) -> int:
         return len(self.problem.series.times)
 
-    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
-        return assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SequenceOutcome:
+        result = assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+        return SequenceOutcome(**vars(result))
 
     def _described(self) -> tuple[str, Any, int, str]:
         problem, times = self.problem, self.problem.series.times
@@ -199,6 +198,6 @@ class SequenceKind(Cycles[SeriesResult]):
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
 
 
-def cycles_of(config: TwinConfig | SequenceConfig) -> Cycles[Any]:
+def cycles_of(config: TwinConfig | SequenceConfig, on_cycle: Callable[[int], None] | None = None) -> Cycles[Any]:
     """The run that a configuration is of."""
-    return TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
+    return (TwinKind if isinstance(config, TwinConfig) else SequenceKind)(config, on_cycle)

@@ -1,7 +1,7 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -31,7 +31,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.hints import counted, rounded
 from en4dvar.plumbing.units import UnitError
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import FOLDER, digest
+from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
 from en4dvar.results.run_results import has_results, result_files
 from en4dvar.results.together import POPULATION, load_groups_of
@@ -126,12 +126,16 @@ class DesignKind(RunKind[Designs]):
         return needed_file(self.config, _planned_times(self.config))
 
     @cached_property
+    def planned(self) -> Planned:
+        """The design of the file itself. Raises :class:`ConfigError`, :class:`DataError`."""
+        return Planned(planned_problem(self.config), self.config.design.about, self.config.design.common)
+
+    @cached_property
     def asked(self) -> Asked:
         """What is asked. Raises :class:`ConfigError`, :class:`DataError`."""
-        config = self.config
-        problem = planned_problem(config)
+        config, design, planned = self.config, self.config.design, self.planned
+        problem = planned.problem
         terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-        design, planned = config.design, Planned(problem, config.design.about, config.design.common)
         about = [terms[name] for name in planned.about]
         others = [terms[name] for name in planned.names[planned.asked :]] if design.wanted else []
         _wanted(config, problem)
@@ -141,9 +145,9 @@ class DesignKind(RunKind[Designs]):
             symbols=tuple(p.symbol for p in about),
             labels=tuple(p.label for p in about),
             units=tuple((p.unit, p.display_unit) for p in about),
-            knobs=tuple(config.design.knobs),
-            laws=tuple(config.design.laws),
-            enough=config.design.enough,
+            knobs=tuple(design.knobs),
+            laws=tuple(design.laws),
+            enough=design.enough,
             seen=seen.label,
             wanted={name: str(text) for name, text in design.wanted.items()},
             others=tuple((p.name, p.unit, p.display_unit) for p in others),
@@ -155,11 +159,10 @@ class DesignKind(RunKind[Designs]):
         _ = self.asked
 
     def conduct(self, run: Session, executor: Executor) -> Designs:
-        fingerprint = digest(run.identity.settings.encode())
-        kept = KeptUnits(run, STATE, fingerprint, Done, "all designs are evaluated again")
+        kept = KeptUnits(run, STATE, Done, "all designs are evaluated again")
         self._evaluate_all(kept, executor)
         file = run.directory.at(self.result)
-        save_designs(file, [*self._rows(kept.done)], self.asked, {**run.attributes, "name": self.config.name})
+        save_designs(file, [*self._rows(kept.done.values())], self.asked, {**run.attributes, "name": self.config.name})
         return load_designs(file)
 
     def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
@@ -179,13 +182,13 @@ class DesignKind(RunKind[Designs]):
             self._evaluate(kept, executor, every, auto)
             return
         self._evaluate(kept, executor, every, "laplace")
-        told = {d.number: d.results for d in kept.done if d.method == "laplace" and d.results}
+        told = {d.number: d.results for d in kept.done.values() if d.method == "laplace" and d.results}
         best = sorted(told, key=lambda number: -told[number][0].gain)[:CHECKED]
         checked = [n for n in dict.fromkeys([0, *best]) if n in told]
         self._evaluate(kept, executor, checked, "nested")
         off = {
             d.number: n.gain - o.gain
-            for d in kept.done if d.method == "nested"
+            for d in kept.done.values() if d.method == "nested"
             for n, o in zip(d.results, told[d.number], strict=False)
             if n.thin <= THIN and abs(n.gain - o.gain) > AGREE + 2 * n.error
         }  # fmt: skip
@@ -196,28 +199,27 @@ class DesignKind(RunKind[Designs]):
             self._evaluate(kept, executor, list(told), "nested")
 
     def _say(self, kept: KeptUnits[Done], words: str) -> None:
-        kept.log.write(words)
+        kept.log(words)
         if self.tell_cost:
             self.tell_cost(words)
 
     def _cost(self, numbers: Sequence[int], method: Method) -> str:
         """What it takes to evaluate so many designs, in words; they are taken to be as the first."""
         design = self.config.design
-        planned = Planned(planned_problem(self.config), design.about, design.common)
-        runs = span_of_runs(planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
+        runs = span_of_runs(self.planned, design.part(SampleSizes), method, design.choose is not None, len(design.laws))
         return f"{counted(len(numbers), 'design')} by {method}, about {rounded(*runs)} forward runs each"
 
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
-        done = {d.number for d in kept.done if d.method == method}
-        calls = [(n, self.every[n], method, self.config.seed) for n in numbers if n not in done]
+        calls = {f"{method} {n}": (n, self.every[n], method, self.config.seed) for n in numbers}
         kept.work(
-            executor, _one, calls, self.tell, len(numbers), line=_line,
+            executor, _one, calls, self.tell, line=lambda _, done: _line(done),
             failed=lambda number, *_, reason: Done(number, method, (), reason),
         )  # fmt: skip
-        if not any(d.results for d in kept.done):
-            raise ConfigError(f"none of the designs can be evaluated: {kept.done[0].failure}")
+        every = list(kept.done.values())
+        if not any(d.results for d in every):
+            raise ConfigError(f"none of the designs can be evaluated: {every[0].failure}")
 
-    def _rows(self, done: Sequence[Done]) -> Iterator[DesignRow]:
+    def _rows(self, done: Iterable[Done]) -> Iterator[DesignRow]:
         """Every candidate, or number of experiments alike, in the order of the file."""
         for d in sorted(_latest(done), key=lambda d: d.number):
             settings, price = dict(self.every[d.number].settings), self.every[d.number].config.design.price
@@ -227,7 +229,7 @@ class DesignKind(RunKind[Designs]):
                 yield DesignRow(d.number, settings, None, float("nan"), d.failure)
 
 
-def _latest(done: Sequence[Done]) -> list[Done]:
+def _latest(done: Iterable[Done]) -> list[Done]:
     """Of each candidate what came last: nested after laplace, which stays where the nested one rests on few draws."""
     latest: dict[int, Done] = {}
     for d in done:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from types import GenericAlias
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
@@ -19,13 +19,13 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
-from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
+from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, digest, read_checkpoint, write_checkpoint
 from en4dvar.results.kinds import kind_in, require_result
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
 from en4dvar.results.run_results import has_results
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
-from en4dvar.runs.progress import RunLog
+from en4dvar.runs.progress import run_log
 from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
 
 R = TypeVar("R")
@@ -113,31 +113,27 @@ class RunKind(Kind, ABC, Generic[R]):
         Raises :class:`OutputError` and what the computation raises.
         """
 
-    def stop(self) -> None:
-        """End what computes in threads of this process."""
-
-
-class Log(Protocol):
-    """Where a run at work writes what it does."""
-
-    def write(self, message: str, /) -> None: ...
-
 
 @dataclass
 class Session:
     """A run at work in its directory.
 
-    ``attributes`` go into its result files; ``notices`` are what the run itself found worth a warning. It has ``begun``
-    once its directory says what it is.
+    ``log`` writes down what it does. ``attributes`` go into its result files; ``notices`` are what the run itself found
+    worth a warning. It has ``begun`` once its directory says what it is.
     """
 
     config: Any
     directory: RunDirectory
-    log: Log
+    log: Callable[[str], None]
     identity: Identity
     attributes: Mapping[str, str]
     notices: list[str] = field(default_factory=list)
     begun: bool = False
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest of what decides the numbers, data included."""
+        return digest(self.identity.settings.encode() + repr(self.identity.data).encode())
 
     def earlier(self) -> Identity | None:
         """The identity of the run that is resumed. Raises :class:`CheckpointError`."""
@@ -177,35 +173,42 @@ class Session:
     def notice(self, message: str) -> None:
         """Something about the run itself that the user should know."""
         self.notices.append(message)
-        self.log.write(f"warning: {message}")
+        self.log(f"warning: {message}")
 
 
 class KeptUnits(Generic[S]):
-    """What is ``done`` of the units of work of a run, in the order of their ends; kept as by :meth:`Session.kept`."""
+    """What is ``done`` of the units of work of a run, by their names, in the order of their ends; kept as by
+    :meth:`Session.kept`.
+    """
 
-    def __init__(self, run: Session, file: str, fingerprint: str, kind: type[S], otherwise: str):
-        kinds: Any = GenericAlias(tuple, (kind, ...))
-        before, self.keeper = run.kept(file, fingerprint, kinds, otherwise)
+    def __init__(self, run: Session, file: str, kind: type[S], otherwise: str):
+        kinds: Any = GenericAlias(tuple, (GenericAlias(tuple, (str, kind)), ...))
+        before, self.keeper = run.kept(file, run.fingerprint, kinds, otherwise)
         self.log = run.log
-        self.done: list[S] = [*(before or ())]
+        self.done: dict[str, S] = dict(before or ())
 
     def work(
-        self, executor: Executor, function: Callable[..., S], calls: Sequence[tuple[Any, ...]], tell: Tell | None,
-        total: int, *, failed: Callable[..., S], line: Callable[[S], str],
-    ) -> None:  # fmt: skip
-        """Do the ``calls`` that are left of a ``total``: ``failed`` makes a unit of a call and the reason why it ended
-        in an error, ``line`` is what the log says of a unit.
+        self, executor: Executor, function: Callable[..., S], calls: Mapping[str, tuple[Any, ...]], tell: Tell | None,
+        *, failed: Callable[..., S], line: Callable[[str, S], str],
+    ) -> list[S]:  # fmt: skip
+        """The units of ``calls`` (name → arguments), in their order; those that are not done are done: ``failed`` makes
+        a unit of a call and the reason why it ended in an error, ``line`` is what the log says of one, by its name.
         """
-        for count, (i, ended) in enumerate(executor.map(function, iter(calls)), 1):
-            if isinstance(ended, Exception):
-                reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
-                ended = failed(*calls[i], reason=reason)
-            self.done.append(ended)
-            self.log.write(line(ended))
-            self.keeper.keep(lambda: tuple(self.done))
-            if tell:
-                tell(total - len(calls) + count, total)
-        self.keeper.write(tuple(self.done))
+        left, tell = [name for name in calls if name not in self.done], tell or (lambda done, total: None)
+        before = len(calls) - len(left)
+        tell(before, len(calls))
+        try:
+            for count, (i, ended) in enumerate(executor.map(function, (calls[name] for name in left)), 1):
+                if isinstance(ended, Exception):
+                    reason = str(ended) if isinstance(ended, En4dvarError) else reason_of(ended)
+                    ended = failed(*calls[left[i]], reason=reason)
+                self.done[left[i]] = ended
+                self.log(line(left[i], ended))
+                self.keeper.keep(lambda: tuple(self.done.items()))
+                tell(before + count, len(calls))
+        finally:
+            self.keeper.write(tuple(self.done.items()))
+        return [self.done[name] for name in calls]
 
 
 def require_some(units: str, failures: Sequence[str]) -> None:
@@ -239,7 +242,6 @@ def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, com
                     kind.page(directory.work, figures=kind.config.figures)
                 return result
             except BaseException:  # no worker writes once the directory is free for others
-                kind.stop()
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
                     executor.kill()
                 raise
@@ -290,13 +292,14 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
+            "identity": who.settings,
         }
-        with RunLog(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
+        with run_log(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
             run = Session(config, directory, log, who, attributes)
             try:
-                log.write(attributes["history"])
+                log(attributes["history"])
                 yield run
-                log.write("done")
+                log("done")
             except (ExecutorError, OutputError) as error:
                 if isinstance(error, UnguardedError) or not run.begun:
                     raise

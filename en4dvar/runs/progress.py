@@ -1,6 +1,5 @@
 """What a run tells while it runs: one line an iteration in ``run.log``, a live line on a terminal."""
 
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -8,8 +7,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.compiled import watch_compilation
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import own_file, refused
-from en4dvar.plumbing.hints import short
+from en4dvar.plumbing.hints import duration, short
 from en4dvar.plumbing.tables import without_control
 from en4dvar.plumbing.units import convert
 from en4dvar.runs.interrupt import Interrupted
@@ -73,40 +71,35 @@ def intervals(name: str, record: Record, parameters: Sequence[Parameter]) -> str
     return f"\n{name}: iteration {record.iteration:2d}  90 %: {', '.join(words)}" if words else ""
 
 
-class RunLog:
-    """``run.log``: time and message, each written at once so that a killed run leaves what it knew. Raises
-    :class:`OutputError` where it cannot be opened or, while the run is at work, written.
+@contextmanager
+def run_log(path: Path, append: bool = False) -> Iterator[Callable[[str], None]]:
+    """Within, what appends every line of a message to ``run.log`` with the time of day, at once, so that a killed run
+    leaves what it knew; at the end why the block was left, where it raised. Raises :class:`OutputError` where the file
+    cannot be opened or, while the run is at work, written.
     """
+    with refused(path, "cannot be written"):
+        handle = own_file(path)
+        if not append:
+            os.ftruncate(handle, 0)
+        file = os.fdopen(handle, "a", encoding="utf-8", errors="backslashreplace", buffering=1)
 
-    def __init__(self, path: Path, append: bool = False):
-        with refused(path, "cannot be written"):
-            handle = own_file(path)
-            if not append:
-                os.ftruncate(handle, 0)
-            self._file = os.fdopen(handle, "a", encoding="utf-8", errors="backslashreplace", buffering=1)
-        self._path = path
-
-    def write(self, message: str) -> None:
-        """Append every line of ``message`` with the time of day."""
+    def write(message: str) -> None:
         now = datetime.now().astimezone().isoformat(timespec="milliseconds")
-        with refused(self._path, "cannot be written"):
-            self._file.write("".join(f"{now} {without_control(line)}\n" for line in message.splitlines()))
+        with refused(path, "cannot be written"):
+            file.write("".join(f"{now} {without_control(line)}\n" for line in message.splitlines()))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
-                if isinstance(value, KeyboardInterrupt):
-                    self.write(str(value) if isinstance(value, Interrupted) else "interrupted")
-                elif value is not None:
-                    self.write(f"failed: {type(value).__name__}: {value}")
-        finally:
-            with suppress(OSError):
-                self._file.close()
+    try:
+        yield write
+    except BaseException as error:
+        words = f"failed: {type(error).__name__}: {error}"
+        if isinstance(error, KeyboardInterrupt):
+            words = str(error) if isinstance(error, Interrupted) else "interrupted"
+        with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
+            write(words)
+        raise
+    finally:
+        with suppress(OSError):
+            file.close()
 
 
 class LiveProgress:
@@ -162,11 +155,7 @@ def time_left(gone: float, done: int, total: int, iterations: Sequence[int], len
     work = done + sum(min(0.9, i / max(expected, 1.0)) for i in iterations)
     if gone < 1.0 or work <= 0 or done >= total:
         return ""
-    seconds = gone * (total - work) / work
-    for limit, size, unit in ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (math.inf, 3600.0, "h")):
-        if seconds < limit:
-            return f"about {max(1, round(seconds / size))} {unit} left"
-    return ""
+    return f"about {duration(max(1, round(gone * (total - work) / work)))} left"
 
 
 @contextmanager

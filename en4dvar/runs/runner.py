@@ -16,9 +16,9 @@ from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.together import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.checks import checked_problem, require_counted_once
+from en4dvar.runs.checks import checked_problem, require_together
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
-from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of, require_population
+from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
@@ -116,17 +116,14 @@ class EstimateKind(RunKind[Campaign]):
     def check(self) -> None:
         """Raise what is wrong with the data files where none can be used, one is in no group, or one counts twice."""
         config, files = self.config, self.data
-        for name in files:
-            config.sharing.of_dataset(name)
-        groups_of(config, files)
         refused: list[ConfigError | DataError] = []
         for name, file in files.items():
             try:
-                require_population(config, checked_problem(config, name, file), files)
+                problem = checked_problem(config, name, file)
             except (ConfigError, DataError) as error:
                 refused.append(error)
             else:
-                require_counted_once(config, files)
+                require_together(config, problem, files)
                 return
         if len(refused) == 1:
             raise refused[0]
@@ -162,10 +159,6 @@ class EstimateKind(RunKind[Campaign]):
             work.summarise()
         return work.campaign()
 
-    def stop(self) -> None:
-        if self.work:
-            self.work.stop.set()
-
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report import write_pages  # what draws pages is slow to import
@@ -189,10 +182,9 @@ def _estimate(work: Worklist, executor: Executor) -> None:
         good = work.good()
         if work.alone or not good:
             return
-        attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         try:
             path, sources = work.run.directory.at("posterior.nc"), {d.name: d.stem for d in good}
-            save_campaign(path, work.pack, sources, attributes, work.failures())
+            save_campaign(path, work.pack, sources, work.run.attributes, work.failures())
             return
         except DamagedError as error:
             if not repeated.isdisjoint(error.names):

@@ -98,7 +98,7 @@ class TogetherKind(Kind, ABC):
             configs = {s.config.resolved: s.config for s in sets}.values()
             made_of = [repr(self), *(identity(c.resolved, c.model, {}).settings for c in configs)]
             made_of += [file_digest(run_dir / name) for run_dir in run_dirs for name in (PACK, "posterior.nc")]
-            session = Session(config, directory, _Terminal(tell), Identity("", ()), attributes)
+            session = Session(config, directory, tell, Identity("", ()), attributes)
             try:
                 directory.claim(*names, record, under_way(record))
                 directory.folder(FOLDER)
@@ -160,22 +160,14 @@ class TogetherKind(Kind, ABC):
         def sets() -> list[Finished]:
             return [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
 
-        attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
-        attributes |= {"group": group.name} if group else {}
+        attributes = {**run.attributes, "runs": config.name, **({"group": group.name} if group else {})}
         try:
             self._estimate(
                 run, sets, executor, attributes, file, record, [run.identity.settings, *digests],
-                lambda words: run.log.write(f"{what}: {words}"),
+                lambda words: run.log(f"{what}: {words}"),
             )  # fmt: skip
         except TooFewMembersError as error:
             run.notice(f"no {what}; the data sets are estimated alone: {error}")
-
-
-@dataclass(frozen=True)
-class _Terminal:
-    """In place of the log of a run: ``write`` tells the user."""
-
-    write: Tell
 
 
 def under_way(record: str) -> str:
@@ -344,11 +336,13 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
         return
     groups = groups_of(config, names)
     count = max((len(group.datasets) for group in groups), default=len(names))
+    alone = "to estimate each without one: --set population=null"
     try:
+        if len(problem.parts) > 1:  # as finished_set, before anything is computed
+            raise ConfigError(f"a population needs data sets of one series each; {alone}")
         if count < FEWEST_SETS:
             where = " in the largest group" if groups else ""
-            words = f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}"
-            raise ConfigError(f"{words}; to estimate each without one: --set population=null")
+            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}; {alone}")
         of_campaign.require_population([problem], config.population.of)
     except ConfigError as error:
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None

@@ -15,21 +15,22 @@ import numpy as np
 from en4dvar.config import TwinConfig, load_twin
 from en4dvar.config.document import parse_document
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, available_cores
-from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.paper import on_paper
 from en4dvar.report.text import plus_minus
-from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
+from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.provenance import identity
-from en4dvar.runs.engine import RunKind, Session, conduct_run, require_some
+from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run, require_some
 from en4dvar.series.twin import TwinExperiment, conduct
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+STATE = f"{FOLDER}/sweep"
 COLOURS = ("prior", "posterior", "background")  # of the estimates
 
 
@@ -69,7 +70,7 @@ class TwinSweep:
         for values, runs in zip(self.values, self.runs, strict=True):
             for seed, run in zip(self.seeds, runs, strict=True):
                 for words in run.warnings:
-                    line = f"{', '.join(map(_text, values))}, seed {seed}: {words}"
+                    line = f"{_words(values)}, seed {seed}: {words}"
                     told.setdefault(words.rpartition("; ")[2], []).append(line)
         total = len(self.values) * len(self.seeds)
         return (f"{len(lines)} of {total} runs, the first is {lines[0]}" for lines in told.values())
@@ -85,7 +86,7 @@ class TwinSweep:
 
     def plot(self) -> "Figure":
         """RMSE of each estimate, with its standard error, over the settings."""
-        names = [", ".join(map(_text, values)) for values in self.values]
+        names = [*map(_words, self.values)]
         panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)
         for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):
             at = [i for i, runs in enumerate(self.runs) if estimate in averages(runs)]
@@ -167,7 +168,7 @@ class SweepKind(RunKind[TwinSweep]):
     units = "finished runs"
     result = "sweep.csv"
     readers = ()
-    files = (result, "runs.csv", f"{FOLDER}/*.run")
+    files = (result, "runs.csv", STATE)
 
     config: TwinConfig
     configs: Sequence[TwinConfig]
@@ -175,7 +176,7 @@ class SweepKind(RunKind[TwinSweep]):
     values: tuple[tuple[Any, ...], ...]
     seeds: tuple[int, ...]
     workers: int | None
-    progress: Callable[[int, int], None] | None
+    progress: Tell | None
 
     def executor(self) -> Executor:
         """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
@@ -197,24 +198,19 @@ class SweepKind(RunKind[TwinSweep]):
         settings = [(c.experiment, identity(c.resolved, c.experiment.model, {}).settings) for c in self.configs]
         jobs = [(experiment, seed) for experiment, _ in settings for seed in self.seeds]
         marks = [digest(f"{text}\nseed of the run: {seed}".encode()) for _, text in settings for seed in self.seeds]
-        files = [f"{FOLDER}/{mark[:24]}.run" for mark in marks]
-        again, tell = "its run is conducted again", self.progress or (lambda done, total: None)
-        kept = (session.restore(file, mark, TwinRun, again) for file, mark in zip(files, marks, strict=True))
-        done = {i: run for i, run in enumerate(kept) if run is not None}
-        left = [i for i in range(len(jobs)) if i not in done]
-        tell(len(done), len(jobs))
-        for n, value in executor.results(_one, (jobs[i] for i in left)):
-            done[left[n]] = value
-            write_checkpoint(session.directory.at(files[left[n]]), marks[left[n]], value)
-            tell(len(done), len(jobs))
-        return [done[i] for i in range(len(jobs))]
+        words = [f"{_words(values)}, seed {seed}" for values in self.values for seed in self.seeds]
+        named = dict(zip(marks, words, strict=True))
+        kept = KeptUnits(session, STATE, TwinRun, "all runs are conducted again")
+        kept.work(
+            executor, _one, dict(zip(marks, jobs, strict=True)), self.progress,
+            failed=lambda *_, reason: TwinRun(failure=readable(reason)),
+            line=lambda mark, run: f"{named[mark]}: {run.failure or 'done'}",
+        )  # fmt: skip
+        return [kept.done[mark] for mark in marks]
 
 
 def _one(experiment: TwinExperiment, seed: int) -> TwinRun:
-    try:
-        result = conduct(experiment, seed)
-    except En4dvarError as error:
-        return TwinRun(failure=readable(error))
+    result = conduct(experiment, seed)
     scores = tuple((name, score.mean_rmse, score.mean_spread) for name, score in result.scores.items())
     return TwinRun(scores, warnings=result.warnings)
 
@@ -245,6 +241,10 @@ def runs_table(sweep: TwinSweep) -> Iterator[list[str]]:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else repr(value)
+
+
+def _words(values: Sequence[Any]) -> str:
+    return ", ".join(map(_text, values))
 
 
 def _with_error(value: float, error: float) -> str:

@@ -19,7 +19,7 @@ from en4dvar.data.observations import SEVERAL
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.summary import brief, dataset_rows, remarks, summary_rows
-from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
+from en4dvar.executor import Executor, ExecutorError, SerialExecutor
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
@@ -50,7 +50,7 @@ class Job:
     is pickled once.
 
     ``source``: its data file; ``attributes``, beside the common ones, go into the file of its result. For the
-    forward runs ``before``, ``keeper`` and ``stop`` see :class:`Journal`. ``alone``: the result is a file of its own,
+    forward runs ``before`` and their ``keeper`` see :class:`Journal`. ``alone``: the result is a file of its own,
     not one of a pack.
     """
 
@@ -60,7 +60,6 @@ class Job:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     before: KnownRuns = field(default_factory=KnownRuns)
     keeper: Keeper | None = None
-    stop: threading.Event | None = None
     alone: bool = False
 
     @cached_property
@@ -90,7 +89,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     """
     config, attributes = job.common.value
     seed = own_seed(config.seed, job.name)
-    journal = Journal(executor or SerialExecutor(), job.before, job.keeper, job.stop)
+    journal = Journal(executor or SerialExecutor(), job.before, job.keeper)
     analysis = assimilate(job.problem, config.assimilation, seed, journal, journal.untold(progress))
     result = StoredResult.from_analysis(analysis, {**attributes, **job.attributes})
     content: SealedBytes | bytes = to_bytes(result.groups) if job.alone else packed(result.groups)
@@ -193,17 +192,15 @@ class Worklist:
     """Estimates what is left to do and keeps each data set's file and record as it ends.
 
     ``ended`` fills with what is done: name → how it failed, None where there is a posterior; everything else that is
-    known of a data set stays on disk. ``stop`` ends the estimates in threads of this process.
+    known of a data set stays on disk.
     """
 
     def __init__(self, config: Config, run: Session, sets: tuple[Dataset, ...], progress: Progress | None):
         self.config, self.run, self.sets, self.progress = config, run, sets, progress
         self.ended: dict[str, DatasetOutcome | None] = {}
-        self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
-        attributes = {**run.attributes, "identity": run.identity.settings}
-        self.common: CommonValue[Common] = CommonValue((config, attributes))
+        self.common: CommonValue[Common] = CommonValue((config, run.attributes))
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 
     def good(self) -> list[Dataset]:
@@ -256,7 +253,6 @@ class Worklist:
     def recall(self) -> None:
         """Take over what an earlier run finished, by its checksums; what failed or cannot be trusted is done again."""
         finished = not self.alone and self.run.directory.at("posterior.nc").exists()
-        left = {f"{FOLDER}/{path.name}" for path in self.run.directory.at(FOLDER).iterdir()}
         for d in self.sets:
             entry = self.pack.entries.get(d.stem)
             if entry is None and finished:
@@ -276,9 +272,8 @@ class Worklist:
                 self.estimate_again([d.name])
                 continue
             self.ended[d.name] = None
-            if d.iteration in left:  # of a run killed between its last two steps
-                self.run.directory.remove(d.iteration)
-        self.run.log.write(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
+            remove_file(self._checkpoint(d))  # of a run killed between its last two steps
+        self.run.log(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
 
     def estimate_again(self, names: Sequence[str]) -> None:
         """Forget that data sets are done, whose results cannot be read."""
@@ -306,10 +301,10 @@ class Worklist:
             self.run.directory.remove(SUMMARY)  # of what was done before: where it is there, it is of every data set
         sent: list[Dataset] = []
 
-        def jobs(reads: bool = False, stop: threading.Event | None = None) -> Iterator[tuple[Job]]:
+        def jobs(reads: bool = False) -> Iterator[tuple[Job]]:
             for d in todo:
                 try:
-                    job = self._job(d, stop)
+                    job = self._job(d)
                     if not reads:
                         _ = job.problem  # its file is read here
                 except Exception as error:
@@ -319,8 +314,7 @@ class Worklist:
                     yield (job,)
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
-            stop = self.stop if isinstance(executor, ThreadsExecutor) else None
-            ends = executor.map(estimate_and_tell, jobs(executor.reads, stop), lambda _, records: self._tell(records))
+            ends = executor.map(estimate_and_tell, jobs(executor.reads), lambda _, records: self._tell(records))
         else:
             alone = SerialExecutor()
             ends = alone.map(lambda job: estimate(job, executor, partial(self._hear_one, job.problem)), jobs())
@@ -333,17 +327,17 @@ class Worklist:
     def _fingerprint(self, d: Dataset) -> str:
         return self.run.identity.of_dataset(d.name)
 
-    def _job(self, d: Dataset, stop: threading.Event | None) -> Job:
+    def _job(self, d: Dataset) -> Job:
         fingerprint, path = self._fingerprint(d), self._checkpoint(d)
         again = f"{d.name} is estimated from the start"
         before = self.run.restore(d.iteration, fingerprint, KnownRuns, again) or KnownRuns()
         if before.forecasts:
-            self.run.log.write(f"{d.name}: continued after {counted(sum(map(len, before.forecasts)), 'forward run')}")
+            self.run.log(f"{d.name}: continued after {counted(sum(map(len, before.forecasts)), 'forward run')}")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
         folder = Path(self.config.document.file).parent  # from which the configuration names the data; pages are shared
         source = readable(SEVERAL.join(path_from(folder, str(path)) for path in d.source.paths))
         own = {"data_sha256": self.run.identity.content[d.name], "data_source": source}
-        return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)
+        return Job(self.common, d.name, d.source, own, before, keeper, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:
         """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
@@ -356,7 +350,7 @@ class Worklist:
 
     def _tell(self, records: Sequence[Told], *lines: str) -> None:
         """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""
-        self.run.log.write("\n".join([*(line for told in records for line in self._lines(*told)), *lines]))
+        self.run.log("\n".join([*(line for told in records for line in self._lines(*told)), *lines]))
         if self.progress is not None:
             for name, record, _ in records:
                 self.progress(name, record)
@@ -388,10 +382,10 @@ class Worklist:
             raise error
         known = isinstance(error, En4dvarError)
         reason = readable(error if known else f"{type(error).__name__}: {error}")
-        self.run.log.write(f"{d.name}: failed: {reason}")
+        self.run.log(f"{d.name}: failed: {reason}")
         if not known:
-            self.run.log.write("".join(traceback.format_exception(error)))
-        if len(self.sets) == 1:
+            self.run.log("".join(traceback.format_exception(error)))
+        if self.alone:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
         failed = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)

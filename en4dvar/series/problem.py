@@ -10,7 +10,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Series
 from en4dvar.diagnosis.diagnostics import chi2_interval, common_reasons
 from en4dvar.executor import Executor
-from en4dvar.model.forward import Observable
+from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import Array
 from en4dvar.series.moments import SequentialState
 from en4dvar.series.sequential import run_sequential
@@ -82,9 +82,22 @@ class SeriesResult:
     run: SequentialState
 
     @property
+    def series(self) -> CycleSeries:
+        """What was observed."""
+        return self.problem.series
+
+    @property
+    def model(self) -> ForwardModel:
+        """What the ensemble was run with."""
+        return self.problem.start.model
+
+    @property
     def normalised(self) -> Array:
-        """(K, p) innovations over their expected standard deviations, √(forecast + observation variance)."""
-        return normalised_innovations(self.problem.series, self.run)
+        """(K, p) innovations over their expected standard deviations, √(forecast + observation variance), NaN in
+        gaps.
+        """
+        series, predicted = self.series, self.run.predicted
+        return np.asarray((series.values - predicted.mean) / np.hypot(predicted.std, series.std))
 
     @property
     def log_evidence(self) -> float:
@@ -94,10 +107,7 @@ class SeriesResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons not to trust the spread."""
-        problem, times = self.problem, len(self.problem.series.times)
-        told = [*members_lost(self.run, problem.members)]
-        told += too_few(problem.start, problem.settings, problem.members, times)
-        told += narrowed(self.run, problem.start, problem.settings, times)
+        told = [*self.of_members]
         size, (low, high) = scatter(self.normalised)
         missed, (_, most) = scatter(self.run.residuals)
         if missed > max(TOO_SURE, most):
@@ -113,6 +123,13 @@ class SeriesResult:
         if size < min(TOO_WIDE, low):
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
+
+    @property
+    def of_members(self) -> Iterator[str]:
+        """Those of :attr:`warnings` that its members give, whatever was observed."""
+        yield from members_lost(self.run, self.problem.members)
+        yield from too_few(self.problem)
+        yield from narrowed(self.problem, self.run)
 
 
 def scatter(normalised: Array) -> tuple[float, Array]:
@@ -132,11 +149,12 @@ def members_lost(run: SequentialState, members: int) -> Iterator[str]:
         )
 
 
-def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, times: int) -> Iterator[str]:
+def too_few(problem: SeriesProblem) -> Iterator[str]:
     """Where members are fewer than what they must span, and one more: the state that a square root widens by a model
-    error, or what a window of ``times`` at most estimates, state and model error.
+    error, or what a window, of all times at most, estimates, state and model error.
     """
-    lag, error = min(settings.scheme.lag, times), settings.model_error
+    start, settings, members = problem.start, problem.settings, problem.members
+    lag, error = min(settings.scheme.lag, len(problem.series.times)), settings.model_error
     if error is None:
         return
     size = sum(field.size for field in start.model.layout if field.name not in start.fixed)
@@ -154,30 +172,26 @@ def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, 
         )
 
 
-def narrowed(run: SequentialState, start: InitialEnsemble, settings: SequentialSettings, times: int) -> Iterator[str]:
+def narrowed(problem: SeriesProblem, run: SequentialState) -> Iterator[str]:
     """Where perturbed observations make constants too sure: what moves and narrows bystanders is chance alone.
 
     In each cycle chance takes a share d of the variance P and adds as much to the squared error e²: e² ← e² + d P and
     P ← (1 − d) λ² P. An inflation λ = exp(¾ d) lets P grow by d/2 a cycle, which keeps e² below 2 P.
     """
-    error, layout, by = settings.model_error, start.model.layout, run.bystanders
+    start, settings, by = problem.start, problem.settings, run.bystanders
+    error, layout = settings.model_error, start.model.layout
     names = [name for name in (start.prior.names if start.prior else ()) if name in layout.names]
     constant = [name for name in names if error is None or not np.any(error.rate[layout[name]])]
     if not (constant and by.size):
         return
     variances = by.var(axis=0, ddof=1)
     if (excess := math.sqrt(np.mean((1 + by.mean(axis=0) ** 2) / variances))) > CHANCE:
-        taken = 2 * math.log(settings.inflation.multiplicative) - math.log(variances.mean()) / times
+        taken = 2 * math.log(settings.inflation.multiplicative) - math.log(variances.mean()) / len(problem.series.times)
         yield (
             f"perturbed observations move and narrow {', '.join(constant)} by chance, cycle by cycle: what no reading "
             f"tells of would be off by {excess:.2g} times its spread; give inflation: "
             f"{math.ceil(1000 * math.exp(0.75 * taken)) / 1000:g}, or more members"
         )
-
-
-def normalised_innovations(series: CycleSeries, run: SequentialState) -> Array:
-    """(K, p) innovations over their expected standard deviations, NaN in gaps."""
-    return np.asarray((series.values - run.predicted.mean) / np.hypot(run.predicted.std, series.std))
 
 
 def assimilate_series(
@@ -187,14 +201,17 @@ def assimilate_series(
     on_cycle: Callable[[int], None] | None = None,
     resume: SequentialState | None = None,
     keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+    truth: Array | None = None,
 ) -> SeriesResult:
     """Assimilate a series of observations. The same seed gives the same bits for any executor.
 
-    ``on_cycle``, ``resume`` and ``keep`` as for :func:`~en4dvar.series.sequential.run_sequential`, its errors too.
+    ``on_cycle``, ``resume``, ``keep`` and ``truth`` (K, n_state) as for
+    :func:`~en4dvar.series.sequential.run_sequential`, its errors too; members of a twin experiment are independent
+    draws, as the truth is.
     """
-    members = problem.start.members(problem.members, seed, exact=True)
+    members = problem.start.members(problem.members, seed, exact=truth is None)
     run = run_sequential(
         problem.start.model, problem.observables, members, problem.series, problem.settings, seed, executor, on_cycle,
-        resume, keep,
+        resume, keep, truth,
     )  # fmt: skip
     return SeriesResult(problem, seed, run)

@@ -10,7 +10,7 @@ Random numbers: one stream for the truth, one for the errors of the observations
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,10 +19,9 @@ from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.forward import ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
-from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.priors.prior import member_stream
 from en4dvar.series.moments import Moments, SequentialState
-from en4dvar.series.problem import members_lost, narrowed, too_few
-from en4dvar.series.sequential import run_sequential
+from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
@@ -33,29 +32,26 @@ OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
 
 @dataclass(frozen=True)
 class TwinExperiment:
-    """The truth's model is the members' model. ``error_std`` and ``initial_std`` are one number an observable or field.
-    ``error_correlation`` (p, p) is that of the errors of one instant, None: independent.
+    """``start`` is the prior at time zero, and the model, of the truth and of each member. ``error_std`` is one number
+    an observable; ``error_correlation`` (p, p) that of the errors of one instant, None: independent.
 
     Observations are taken every ``interval`` (the model's time unit); the first ``burn_in`` of ``cycles`` do not count
-    in averages. ``fixed`` are the values of the parameters that ``prior`` does not draw.
+    in averages.
     """
 
-    model: ForwardModel
+    start: InitialEnsemble
     sequential: SequentialSettings
     members: int
     cycles: int
     interval: float
     error_std: Mapping[str, float]
-    initial_std: Mapping[str, float]
     burn_in: int = 0
     error_correlation: Correlation | None = None
-    prior: Prior | None = None
-    fixed: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def start(self) -> InitialEnsemble:
-        """The prior at time zero, of the truth and of each member."""
-        return InitialEnsemble(self.model, self.initial_std, self.prior, self.fixed, self.sequential.coordinates)
+    def model(self) -> ForwardModel:
+        """Of the truth and of the members."""
+        return self.start.model
 
     @property
     def observables(self) -> tuple[Observable, ...]:
@@ -85,14 +81,11 @@ class Score:
 
 
 @dataclass(frozen=True)
-class TwinResult:
-    """``truth`` (K, n_state) at ``series.times``, the observations and what the assimilation made of them."""
+class TwinResult(SeriesResult):
+    """What the assimilation made of the observations of a ``truth`` (K, n_state) at ``series.times``."""
 
     experiment: TwinExperiment
-    seed: int
     truth: Array
-    series: CycleSeries
-    run: SequentialState
 
     @property
     def scores(self) -> dict[str, Score]:
@@ -105,15 +98,12 @@ class TwinResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the scores mean less than they seem to."""
-        experiment = self.experiment
-        warnings = [*members_lost(self.run, experiment.members)]
-        warnings += too_few(experiment.start, experiment.sequential, experiment.members, experiment.cycles)
-        warnings += narrowed(self.run, experiment.start, experiment.sequential, experiment.cycles)
-        fields, prior = self.experiment.model.layout, self.experiment.prior
+        warnings = [*self.of_members]
+        fields, start = self.model.layout, self.experiment.start
         names = np.array([f.name for f in fields for _ in range(f.size)])
-        hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]
+        hidden = [value for name, value in start.fixed.items() if name not in fields.names]
         still = self.experiment.dynamic & (np.ptp(self.truth, axis=0) == 0)
-        if prior is None or {*prior.names} <= {*fields.names}:
+        if start.prior is None or {*start.prior.names} <= {*fields.names}:
             still &= np.isin(self.truth[0], hidden)
         if still.any():
             warnings.append(
@@ -194,9 +184,6 @@ def conduct(
     Raises TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
     """
     truth, series = observe_truth(experiment, seed)
-    members = experiment.start.members(experiment.members, seed)
-    run = run_sequential(
-        experiment.model, experiment.observables, members, series, experiment.sequential, seed, executor, on_cycle,
-        resume, keep, truth,
-    )  # fmt: skip
-    return TwinResult(experiment, seed, truth, series, run)
+    problem = SeriesProblem(experiment.start, experiment.observables, series, experiment.sequential, experiment.members)
+    result = assimilate_series(problem, seed, executor, on_cycle, resume, keep, truth)
+    return TwinResult(problem, seed, result.run, experiment, truth)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Number, Source, continuable, note_beginning
+from en4dvar.commands.common import Number, Source, continuable
 
 
 @click.command()
@@ -67,9 +67,8 @@ def sweep(
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     who = identity_of(loaded[0].seed, chosen, {f"{i} {config.name}": config for i, config in enumerate(loaded, 1)})
     files = "sweep.csv", "checkpoints/*", "checkpoints/sweep/*"
-    note_beginning(folder, resume)
     with (
-        continuable(),
+        continuable(folder, resume),
         StudyCheckpoints.open(folder, force, resume, who, files) as keep,
         counted("trajectories") as progress,
         choose_executor(problems[0].model, workers=workers) as executor,
@@ -108,9 +107,8 @@ def study(
 
     plan = load_study(config, Source(Path(config), None, settings).overrides())
     folder = out or Path("runs") / plan.name
-    note_beginning(folder, resume)
     who = identity_of(plan.seed, plan.sweep, plan.named)
-    with continuable(), StudyCheckpoints.open(folder, force, resume, who, FILES) as keep:
+    with continuable(folder, resume), StudyCheckpoints.open(folder, force, resume, who, FILES) as keep:
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, keep.directory.work)
     for gel, comparison in result.comparisons.items():

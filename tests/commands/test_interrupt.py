@@ -22,7 +22,8 @@ assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 STEPS = "runner.estimated_files", "runner.checked_problem", "engine.choose_executor"
 EARLY = tuple(f"en4dvar.runs.{step}" for step in STEPS)
 BEGUN = (
-    *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),
+    *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunDirectory.publish")),
+    "en4dvar.runs.progress.without_control",  # of a line of the log
     *(f"en4dvar.runs.{step}" for step in ("engine.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
     *(f"en4dvar.runs.{step}" for step in ("cycles.series_group", "cycles.conduct", "cycles.TwinKind.summary")),
 )

@@ -10,7 +10,7 @@ from toy_config import csv_text, write_toy
 from en4dvar.config import load_config
 from en4dvar.diagnosis.analysis import Analysis, ChainRecord, StartRecord
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
+from en4dvar.runs.progress import describe, run_log, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 
 
@@ -126,8 +126,8 @@ def test_log(tmp_path: Path, analysis: Analysis) -> None:
     record = analysis.iterations[0]
 
     def broken_run() -> None:
-        with RunLog(tmp_path / "run.log") as log:
-            log.write(describe("gel", record))
+        with run_log(tmp_path / "run.log") as log:
+            log(describe("gel", record))
             assert "active 23" in (tmp_path / "run.log").read_text()  # written at once
             raise ValueError("broken")
 
@@ -137,8 +137,8 @@ def test_log(tmp_path: Path, analysis: Analysis) -> None:
     assert len(lines) == 2
     assert f"J {record.cost:.6g} = {record.background:.4g} + {record.observation:.6g}" in lines[0]
     assert lines[1].endswith("failed: ValueError: broken")
-    with pytest.raises(OutputError, match="cannot be written"):
-        RunLog(tmp_path / "no" / "run.log")
+    with pytest.raises(OutputError, match="cannot be written"), run_log(tmp_path / "no" / "run.log"):
+        pass
 
 
 def test_a_notebook_without_widgets_has_no_line_and_no_warning(monkeypatch):

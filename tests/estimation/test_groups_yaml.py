@@ -18,6 +18,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report import populations
 from en4dvar.report.populations import compare_populations, numbers_of
 from en4dvar.results.together import load_groups_of, load_population
+from en4dvar.runs.checks import validate
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 
@@ -161,8 +162,11 @@ def test_killed_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     ],
 )
 def test_groups_that_are_wrong_are_told_before_anything_is_computed(tmp_path, stiff, asked, words):
+    path = springs(tmp_path, stiff, asked)
     with pytest.raises(ConfigError, match=words):
-        run_campaign(configuration(springs(tmp_path, stiff, asked), tmp_path / "run"))
+        validate(path)
+    with pytest.raises(ConfigError, match=words):
+        run_campaign(configuration(path, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.together import StoredGroups, load_population
+from en4dvar.runs.checks import validate
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
@@ -142,8 +144,16 @@ def test_data_sets_without_a_population_are_reported_alone(tmp_path, monkeypatch
 def test_what_has_no_population_is_told_before_anything_is_computed(tmp_path, n, asked, words):
     path = springs(tmp_path, asked, n)
     with pytest.raises(ConfigError, match=words):
+        validate(path)
+    with pytest.raises(ConfigError, match=words):
         run_campaign(configuration(path, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
+
+
+def test_data_sets_of_several_series_have_none_which_is_told_before_anything_is_computed():
+    path = Path(__file__).resolve().parents[2] / "configs" / "predator_prey.yaml"
+    with pytest.raises(ConfigError, match=r"population: .* of one series each; .*--set population=null"):
+        validate(path, {"population": {"of": ["alpha"]}})
 
 
 @pytest.mark.slow

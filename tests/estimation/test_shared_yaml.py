@@ -17,6 +17,7 @@ from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.together import joint_lines
 from en4dvar.results.together import load_joint
+from en4dvar.runs.checks import check_all
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import join
@@ -159,6 +160,8 @@ def test_all_share_it(tmp_path):
 )  # fmt: skip
 def test_what_cannot_be_shared_is_told_before_anything_is_computed(tmp_path, shared, groups, words):
     path = springs(tmp_path / "a", shared, groups)
+    with pytest.raises(ConfigError, match=words):
+        check_all(path)
     with pytest.raises(ConfigError, match=words):
         run_campaign(configuration(path, tmp_path / "run"))
     assert not (tmp_path / "run").exists()

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from toys import Decay, Dying, Fragile, Vectorised, make_problem
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, choose_executor, cut
 from en4dvar.model.forward import Failure
+from en4dvar.plumbing.children import HaltedError, end_those_of, starts_again
+from en4dvar.results.checkpoint import Journal
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws import get_law
@@ -118,3 +121,15 @@ def test_a_worker_whose_main_process_is_gone_as_it_starts_says_nothing():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_thread_that_is_to_stop_makes_no_further_forecast():
+    """Whatever its code does with an exception that is raised in it."""
+    me, journal = [threading.get_ident()], Journal(SerialExecutor())
+    assert journal.once(lambda: 1) == 1
+    end_those_of(me)
+    try:
+        with pytest.raises(HaltedError):
+            journal.once(lambda: 1)
+    finally:
+        starts_again(me)

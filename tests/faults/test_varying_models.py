@@ -22,6 +22,7 @@ from en4dvar.runs.runner import run
 from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar.series.sequential import SequentialSettings
+from en4dvar.series.start import InitialEnsemble
 from en4dvar.series.twin import TwinExperiment, conduct
 
 TWIN = """\
@@ -172,8 +173,8 @@ class SteppingRing(twin_models.Ring):
 
 def twin(model, **more):
     return TwinExperiment(
-        model=model, sequential=SequentialSettings(ETKF(), **more), members=6, cycles=3, interval=0.1,
-        error_std={"x": 0.1}, initial_std={"x": 0.2, "v": 0.2},
+        start=InitialEnsemble(model, {"x": 0.2, "v": 0.2}), sequential=SequentialSettings(ETKF(), **more), members=6,
+        cycles=3, interval=0.1, error_std={"x": 0.1},
     )  # fmt: skip
 
 

@@ -82,10 +82,11 @@ def test_workers_do_not_change_the_bits(tmp_path):
     assert sweep(tmp_path / "one", seeds=1).runs == sweep(tmp_path / "two", seeds=1, workers=2).runs
 
 
-def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", [TooFewMembersError, MemoryError])
+def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch, kind):
     def fail(experiment, seed):
         if seed == 5 or experiment.sequential.inflation.multiplicative > 1:
-            raise TooFewMembersError("all are lost")
+            raise kind("all are lost")
         return conduct(experiment, seed)
 
     monkeypatch.setattr("en4dvar.runs.twin_sweep.conduct", fail)
@@ -94,6 +95,7 @@ def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch):
         (2, 1), (0, 3), (2, 1), (0, 3)
     ]  # fmt: skip
     assert "all are lost" in (tmp_path / "a" / "runs.csv").read_text()
+    assert "esrf, 1.0, seed 5: " in (tmp_path / "a" / "run.log").read_text()
     assert "2 (1 failed)" in str(found)
 
 

@@ -21,9 +21,11 @@ from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import InnovationRecorder
+from en4dvar.series.problem import SeriesProblem
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import Inflation
+from en4dvar.series.start import InitialEnsemble
 from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
@@ -37,15 +39,21 @@ def lorenz63(scheme, cycles, members=10, inflation=1.02, burn_in=50):
     """Sakov, Oliver & Bertino (2012), Table 1."""
     model = Lorenz63.from_settings(Lorenz63Settings())
     settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
-    return TwinExperiment(model, settings, members, cycles, 0.25, L63, L63, burn_in, fixed=model.defaults)
+    start = InitialEnsemble(model, L63, None, model.defaults)
+    return TwinExperiment(start, settings, members, cycles, 0.25, L63, burn_in)
 
 
 def lorenz96(scheme, cycles, members=25, inflation=1.02, burn_in=100):
     """Sakov & Oke (2008)."""
     model = Lorenz96.from_settings(Lorenz96Settings())
     settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
-    spread = {"x": 0.001**0.5}
-    return TwinExperiment(model, settings, members, cycles, 0.05, {"x": 1.0}, spread, burn_in, fixed=model.defaults)
+    start = InitialEnsemble(model, {"x": 0.001**0.5}, None, model.defaults)
+    return TwinExperiment(start, settings, members, cycles, 0.05, {"x": 1.0}, burn_in)
+
+
+def begun(experiment, **changes):
+    """The same from another start."""
+    return replace(experiment, start=replace(experiment.start, **changes))
 
 
 def rmse(experiment, seed=1, kind="analysis"):
@@ -171,7 +179,8 @@ class InPlace(Named):
 
 def decay(model, **changes):
     rates = {"a": 0.1, "b": 0.2}
-    experiment = TwinExperiment(model, SequentialSettings(ETKF()), 8, 6, 0.5, {"x": 0.1}, {"x": 0.1}, fixed=rates)
+    start = InitialEnsemble(model, {"x": 0.1}, None, rates)
+    experiment = TwinExperiment(start, SequentialSettings(ETKF()), 8, 6, 0.5, {"x": 0.1})
     return replace(experiment, **changes)
 
 
@@ -182,15 +191,16 @@ def test_parameters_in_a_field_of_another_name_are_told_for_they_count_as_state(
     assert hidden.warnings[0].startswith("2 variables of theta never change and have the values of parameters")
     assert named.warnings == ()
     prior = Prior((PriorTerm.normal(Decay.parameters[0], 0.1, 0.01),))
-    assert "2 variables of theta" in conduct(decay(Decay(), prior=prior, fixed={"b": 0.2}), 1).warnings[0]
+    assert "2 variables of theta" in conduct(begun(decay(Decay()), prior=prior, fixed={"b": 0.2}), 1).warnings[0]
 
 
 def test_an_ensemble_that_has_lost_the_truth_is_told():
-    lost = decay(Named(), initial_std={"x": 1e-6})
+    lost = begun(decay(Named()), initial_std={"x": 1e-6})
     truth, series = observe_truth(lost, 1)
     members = lost.start.members(lost.members, 1) + np.array([0.5, 0.5, 0, 0])
+    problem = SeriesProblem(lost.start, lost.observables, series, lost.sequential, lost.members)
     run = run_sequential(lost.model, lost.observables, members, series, lost.sequential)
-    (warning,) = TwinResult(lost, 1, truth, series, run).warnings
+    (warning,) = TwinResult(problem, 1, run, lost, truth).warnings
     assert "far too sure of itself" in warning
 
 
@@ -218,7 +228,7 @@ def test_an_initial_state_that_does_not_fit_is_told():
 
 
 def test_truth_that_cannot_be_integrated():
-    experiment = replace(lorenz96(ETKF(), 5), initial_std={"x": 1e200})
+    experiment = begun(lorenz96(ETKF(), 5), initial_std={"x": 1e200})
     with pytest.raises(En4dvarError, match="truth cannot be integrated: non-finite state"):
         conduct(experiment, 1)
 
@@ -236,7 +246,7 @@ def test_analysis_is_better_than_forecast_and_than_the_observations():
 def test_parameter_is_estimated_with_the_state():
     model = Lorenz96.from_settings(Lorenz96Settings())
     term = PriorTerm.normal(model.parameters[0], 8.0, 0.5)
-    experiment = replace(lorenz96(ETKF(), 400, members=40, inflation=1.01), prior=Prior((term,)), fixed={})
+    experiment = begun(lorenz96(ETKF(), 400, members=40, inflation=1.01), prior=Prior((term,)), fixed={})
     result = conduct(experiment, 1)
     truth, estimate = result.truth[0, 40], result.run.analysis.mean[-1, 40]
     assert np.all(result.truth[:, 40] == truth)
@@ -258,9 +268,9 @@ EXPECTED = {  # config: (cycles, burn-in, upper bound of the analysis RMSE, lowe
 
 def test_a_constant_that_perturbed_observations_make_too_sure_is_told():
     term = PriorTerm.normal(Lorenz63.parameters[1], 28, 1)
-    made = replace(lorenz63(EnKF(), 200, members=12, inflation=1.0), prior=Prior((term,)))
-    fixed = {name: value for name, value in made.fixed.items() if name != term.parameter.name}
-    told = conduct(replace(made, fixed=fixed), 1).warnings
+    made = begun(lorenz63(EnKF(), 200, members=12, inflation=1.0), prior=Prior((term,)))
+    fixed = {name: value for name, value in made.start.fixed.items() if name != term.parameter.name}
+    told = conduct(begun(made, fixed=fixed), 1).warnings
     assert any(words.startswith("perturbed observations move and narrow rho by chance") for words in told)
 
 
