@@ -22,6 +22,7 @@ from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.near_bounds import near_bounds
 from en4dvar.sampling.refine import (
@@ -233,3 +234,13 @@ class Stages:
     def tell(self, record: Record) -> None:
         if self.progress is not None:
             self.progress(self.problem.observations.name, record)
+
+
+def values_of(prior: Prior, x: Array) -> dict[str, float]:
+    """Physical values, by name, of a control vector (n,)."""
+    return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
+
+
+def control_of(prior: Prior, values: Mapping[str, float]) -> Array:
+    """The control vector (n,) of physical values by name, which may hold others."""
+    return prior.from_physical(np.array([values[name] for name in prior.names]))
