@@ -58,20 +58,18 @@ STILL_REACHING = "each round of draws reached farther along the posterior than t
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
-def examine_shape(
-    space: WeightSpace, ensemble: Array, shape: Mapping[str, float], seed: int, settle: bool = True
-) -> dict[str, float]:
+def examine_shape(space: WeightSpace, ensemble: Array, fit: float, seed: int, settle: bool = True) -> dict[str, float]:
     """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
 
-    Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
+    Of the ``ensemble`` (N, n), transformed; ``fit``, the effective share of its members, is ``gaussian_fit`` of them.
     Deterministic in ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
     Where an emulator was needed there are ``mean_shift``, the largest distance of the ensemble's mean from the
     posterior's in posterior standard deviations, ``spread_ratio``, the standard deviation of the ensemble over the
     posterior's where that is farthest from 1, ``emulator_fit``, and
     ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
     """
-    numbers = dict(shape)
-    if shape["gaussian_fit"] < CLEARED:
+    numbers = {"gaussian_fit": fit}
+    if fit < CLEARED:
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
             off = _off(emulator, ensemble)
@@ -83,7 +81,7 @@ def examine_shape(
             for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
                 numbers |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
     doubted = any(walk.spread for walk in space.problem.walks)
-    doubted |= bool(space.settings.own.approximate) and shape["gaussian_fit"] < CLEARED
+    doubted |= bool(space.settings.own.approximate) and fit < CLEARED
     return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, doubted)}
 
 
