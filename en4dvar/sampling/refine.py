@@ -214,8 +214,7 @@ def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     if not _emulates(space.problem, space.settings):
         return None
-    random = member_stream(seed, "emulator")
-    return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random, fits)
+    return emulate(space.forecast, space.problem, ensemble, member_stream(seed, "emulator"), fits)
 
 
 def _emulates(problem: InverseProblem, settings: AssimilationSettings) -> bool:
@@ -355,7 +354,7 @@ def refined(
     below = minima[0].cost - MISSED if looking and minima else -math.inf
     draws = None
     if len(minima) > 1 or not chain:  # the runs of these draws are kept; those of a chain would be too many
-        recorded = RecordedRuns(space.forecast, space.costs, prior, space.problem.observations)
+        recorded = RecordedRuns(space.forecast, space.problem)
         drawn_by = cost if space.settings.emulator == "off" else recorded
         draws = sample_modes(drawn_by, prior, minima, seed, enough, below)
     if draws is not None and draws.lowest < below:
