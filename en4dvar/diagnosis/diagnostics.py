@@ -119,6 +119,15 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> float:
     return effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))
 
 
+def off(ensemble: Array, mean: Array, std: Array) -> tuple[float, float]:
+    """How far members (N, n) are from this mean and standard deviation (n,): the largest distance of their mean in
+    standard deviations, and the ratio of theirs to these where it is farthest from 1.
+    """
+    ratio = ensemble.std(axis=0, ddof=1) / std
+    shift = np.max(np.abs(ensemble.mean(axis=0) - mean) / std)
+    return float(shift), float(ratio[np.argmax(np.abs(np.log(ratio)))])
+
+
 def is_non_gaussian(shape: Mapping[str, float], doubted: bool = False) -> bool:
     """True if mean or spread of the ensemble are not the posterior's, from
     :func:`~en4dvar.sampling.refine.examine_shape` and :func:`~en4dvar.sampling.refine.examine_tails`. ``doubted``: a

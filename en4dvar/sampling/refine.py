@@ -201,13 +201,8 @@ def doubtful(shape: Mapping[str, float]) -> bool:
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
     """How far an ensemble (N, n) is from the emulator's draws."""
-    draws = emulator.draws
-    std = draws.std(axis=0)
-    ratio = ensemble.std(axis=0, ddof=1) / std
-    return {
-        "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
-        "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
-    }
+    shift, ratio = diag.off(ensemble, emulator.draws.mean(axis=0), emulator.draws.std(axis=0))
+    return {"mean_shift": shift, "spread_ratio": ratio}
 
 
 def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> EmulatedCost | None:
@@ -417,12 +412,10 @@ def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:
 
 def _summary(draws: WeightedDraws, posterior: Array) -> dict[str, float]:
     """The numbers that judge weighted draws, and how far they are from the ensemble they replace, for the result."""
-    std = np.sqrt(np.diag(draws.covariance))
-    moved = (draws.mean - posterior.mean(axis=0)) / std
-    widened = np.log(std / posterior.std(axis=0, ddof=1))
+    shift, ratio = diag.off(posterior, draws.mean, np.sqrt(np.diag(draws.covariance)))
     return {
         "importance_draws": len(draws.x),
         "importance_effective_sample_size": draws.effective,
-        "importance_largest_shift": float(np.max(np.abs(moved))),
-        "importance_largest_spread_ratio": float(np.exp(np.max(np.abs(widened)))),
+        "importance_largest_shift": shift,
+        "importance_largest_spread_ratio": max(ratio, 1 / ratio),
     }
