@@ -28,7 +28,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.linalg import resampled, shares_of
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
@@ -269,7 +269,7 @@ def mode_cautions(
     most = int(np.argmax(distances))
     p = prior.parameters[most]
     at = " and ".join(f"{convert(float(m.centre[most]), p.unit, p.display_unit):.3g}" for m in seen)
-    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    unit = unit_after(p.display_unit)
     drawn = "members are drawn from all of them" if result else "members describe only the first"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
     if result and not np.any(distances > APART):
