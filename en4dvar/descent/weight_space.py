@@ -15,6 +15,7 @@ from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.plumbing.hints import listed
 from en4dvar.priors.varying.model import clock
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Minimiser, Weights
@@ -160,14 +161,11 @@ def require_members(problem: InverseProblem, run: Forecast, needed: int, stage: 
 def _lacking(problem: InverseProblem, readings: Sequence[int]) -> str:
     if not readings:
         return ""
-    times = problem.observations.file_times
-    of = [next(part for part in problem.parts if k < part.end) for k in readings[:SHOWN]]
-    told = [
-        f"reading {k - part.begin + 1} of {part.name} (at {clock(problem.model, times[k])})"
-        for k, part in zip(readings, of, strict=False)
-    ]
-    more = f" and {len(readings) - SHOWN} more" if len(readings) > SHOWN else ""
+    times, told = problem.observations.file_times, []
+    for k in readings:
+        part = next(part for part in problem.parts if k < part.end)
+        told.append(f"reading {k - part.begin + 1} of {part.name} (at {clock(problem.model, times[k])})")
     return (
-        f". Too few of them, if any, have a number for {', '.join(told)}{more}: leave such readings out (an empty cell "
-        "of the table, NaN in Python), or narrow the priors to where the model has one"
+        f". Too few of them, if any, have a number for {listed(told, SHOWN, longest=100)}: leave such readings out (an "
+        "empty cell of the table, NaN in Python), or narrow the priors to where the model has one"
     )
