@@ -361,7 +361,7 @@ def refined(
         own = _own_draws(draws.x, draws.shares, draws.mode, draws.costs, len(minima))
         told = () if draws.settled else (caution("chain-not-converged", STILL_REACHING),)
         return Refined(members, summary, own, draws.log_evidence, draws.lowest, draws=kept, warnings=told)
-    several = draws is not None and len(minima) > 1
+    several = len(minima) > 1  # then there are draws
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)
     walked = mcmc.sample(
@@ -371,17 +371,16 @@ def refined(
         target=enough,
         look=look,
         emulated=emulated,
-        proposal=draws.proposal if several and draws is not None else None,
+        proposal=draws.proposal if draws and several else None,
     )
     equal = np.full(len(walked.flat), 1 / len(walked.flat))
     for_one = max(1.0, len(equal) / float(walked.effective.min()))
     mode = belonging(prior, minima, walked.flat, equal, for_one)
-    known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),
         walked.summary(),
         _own_draws(walked.flat, equal, mode, -walked.log_density.ravel(), len(minima)),
-        draws.log_evidence if draws is not None and known else math.nan,
+        draws.log_evidence if draws and draws.effective >= TOO_FEW else math.nan,
         float(-walked.log_density.max()),
         walked.flat[np.argmax(walked.log_density)],
         warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
