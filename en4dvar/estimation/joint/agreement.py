@@ -228,7 +228,7 @@ def _misfits(joint: JointProblem, chi2: Array) -> Iterator[Caution]:
             beyond.append(f"{joint.names[e]} ({chi2[e]:.3g})")
     if beyond:
         words = "χ² per reading under the shared values is larger than the errors explain"
-        yield caution("misfit", f"{words}: {listed(beyond, MOST_NAMES)}")
+        yield caution("misfit", f"{words}: {listed(beyond, MOST_NAMES, longest=200)}")
 
 
 def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> Iterator[Caution]:
