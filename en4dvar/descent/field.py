@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from en4dvar.descent.field_data import FieldData, Pass, mean_of
+from en4dvar.descent.field_data import FieldData, Pass, moment_of
 from en4dvar.descent.loop import Descends, Objective, minimise
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.ensemble.missing import fitted
@@ -32,7 +32,6 @@ from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.schemes.base import mda_inflations
 from en4dvar.schemes.local_gain import ByDistance, Gain, Split, Update, parts
 
-Tangent = Array | Split
 TRIALS, SHORTER = 8, 0.3  # steps that are tried, each so much shorter than the one before
 
 
@@ -74,13 +73,12 @@ class Passes(Objective["Passes"], Descends):
         self.alive, predictions = self.alive[finite], predictions[finite]
         errors = np.sqrt(alpha) * self.data.perturbations(self.seed, f"ES-MDA {a}", self.alive)
         ensemble, alive = self.ensemble, self.alive
-        self.tell(Pass(mean_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part]))
+        self.tell(Pass(moment_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part]))
         anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
-        variance, gain = alpha * self.data.std**2, self.gain
+        tangent, gain = Split(anomalies), self.gain
         if isinstance(gain, ByDistance) and len(gain.common):
             tangent = Split.by_regression(anomalies, ensemble[np.ix_(alive, gain.common)])
-            return [gain.update(tangent, variance, innovations)]
-        return [gain.update(anomalies, variance, innovations)]
+        return [gain.update(tangent, alpha * self.data.std**2, innovations)]
 
     def move(self, going: "Sequence[Passes]", moves: Sequence[Move | None]) -> None:
         for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):
@@ -100,7 +98,7 @@ class Passes(Objective["Passes"], Descends):
 class DualSystem:
     """About an iterate: Y (N, K), H B Hᵀ (K, K), H (x − x̄0) (K,), innovation y − H(x) (K,), error variance (K,)."""
 
-    tangent: Tangent
+    tangent: Split
     covariance: Array
     moved: Array
     innovation: Array
@@ -133,7 +131,7 @@ class FieldDescent(Descends):
     prediction: Array
     background: float = 0.0
     costs: list[float] = field(default_factory=list)
-    tangents: tuple[Tangent, ...] = ()
+    tangents: tuple[Split, ...] = ()
     duals: tuple[Array, ...] = ()
     forward_runs: int = 0
 
@@ -207,13 +205,13 @@ class FieldObjective(Objective[FieldDescent]):
         local = np.delete(self.anomalies, common, axis=1) if len(common) else self.anomalies
         runs = self.data.enough(fitted(local, self.data.runs(beside, count)))
         placed = (runs - at.prediction) / self.epsilon
-        tangent: Tangent = placed - placed.mean(axis=0)
+        tangent = Split(placed - placed.mean(axis=0))
         if len(common):
             X = self.anomalies[:, common]
             steps = np.zeros((len(common), len(at.centre)))
             steps[range(len(common)), common] = size = self.epsilon * X.std(axis=0)
             runs = self.data.predict(lambda some: at.centre + steps[some], len(common))
-            tangent = Split(placed - placed.mean(axis=0), X @ ((runs - at.prediction) / size[:, None]))
+            tangent = replace(tangent, common=X @ ((runs - at.prediction) / size[:, None]))
         between = self.gain.between
         pairs = zip(at.tangents, at.duals, strict=True)
         moved = sum((between(tangent, Y) @ dual for Y, dual in pairs), np.zeros(len(at.prediction)))
@@ -291,10 +289,9 @@ class FieldObjective(Objective[FieldDescent]):
 
         return Pass(centre, at.prediction, members, at.background, at.step.length, dfs=float(at.step.leverages.sum()))
 
-    def update(self, tangent: Tangent) -> Update:
+    def update(self, tangent: Split) -> Update:
         """What turns prior anomalies into posterior ones."""
-        whole = tangent.whole if isinstance(tangent, Split) else tangent
-        return self.gain.update(tangent, self.data.std**2, self.errors - whole)
+        return self.gain.update(tangent, self.data.std**2, self.errors - tangent.whole)
 
     def spread(self, at: FieldDescent) -> None:
         """The posterior ensemble about the centre, in place of the anomalies."""

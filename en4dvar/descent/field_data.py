@@ -85,10 +85,10 @@ class Pass:
     dfs: float = math.nan
 
 
-def mean_of(ensemble: Array, alive: Members) -> Array:
-    """(n,) of some members of (N, n), a part at a time."""
+def moment_of(ensemble: Array, alive: Members, moment: Callable[..., Array] = np.mean) -> Array:
+    """The mean (n,) of some members of (N, n), or another ``moment``, a part at a time."""
     each = parts(ensemble.shape[1], len(ensemble))
-    return np.concatenate([ensemble[alive, part].mean(axis=0) for part in each])
+    return np.concatenate([moment(ensemble[alive, part], axis=0) for part in each])
 
 
 def prior_members(problem: InverseProblem, settings: AssimilationSettings, seed: int) -> Array:
@@ -102,7 +102,7 @@ def prior_members(problem: InverseProblem, settings: AssimilationSettings, seed:
         for i, member in enumerate(ensemble):
             member[n + columns.start : n + columns.stop] = field.draw(seed, i)
     if settings.sampling == "exact":
-        mean = mean_of(ensemble, np.arange(len(ensemble)))
+        mean = moment_of(ensemble, np.arange(len(ensemble)))
         mean[:n] -= prior.mean
         ensemble -= mean
     return ensemble

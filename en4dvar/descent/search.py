@@ -47,8 +47,14 @@ class Search:
         self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
 
     def challenged(self, outcome: Outcome) -> Outcome:
-        """After a descent from the member farthest from the lowest minimum."""
-        return self.round(outcome, [challenger(self.space, self.run, outcome)])
+        """After a descent from the member farthest from the lowest minimum, in standard deviations of the Gaussian
+        about it, of those in the half of lower J that were not tried.
+        """
+        costs = self.space.member_costs(self.run)[:-1]
+        order: list[int] = np.argsort(costs, kind="stable").tolist()
+        better = order[: max(len(outcome.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
+        far, lowest = [i for i in better if i not in outcome.tried], outcome.minima[0]
+        return self.round(outcome, [max(far, key=lambda i: lowest.distance(self.space.members[i]))])
 
     def settled(self, outcome: Outcome) -> Outcome:
         """After ``starts`` members more, and again while descents do not agree and the budget lasts."""
@@ -203,14 +209,3 @@ def from_draw(space: WeightSpace, outcome: Outcome, x: Array, tell: Callable[[Re
         return outcome
     runs = outcome.runs + space.forward_runs - before
     return replace(after, tried=(*outcome.tried, draw), runs=runs, rounds=rounds)
-
-
-def challenger(space: WeightSpace, run: Forecast, outcome: Outcome) -> int:
-    """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
-    half of lower J that were not tried.
-    """
-    costs = space.member_costs(run)[:-1]
-    order: list[int] = np.argsort(costs, kind="stable").tolist()
-    better = order[: max(len(outcome.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
-    lowest = outcome.minima[0]
-    return max((i for i in better if i not in outcome.tried), key=lambda i: lowest.distance(space.members[i]))

@@ -15,6 +15,8 @@ from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.plumbing.hints import listed
+from en4dvar.priors.varying.model import clock
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Minimiser, Weights
 from en4dvar.schemes.settings import AssimilationSettings
@@ -159,15 +161,11 @@ def require_members(problem: InverseProblem, run: Forecast, needed: int, stage: 
 def _lacking(problem: InverseProblem, readings: Sequence[int]) -> str:
     if not readings:
         return ""
-    parts, times = problem.parts, problem.observations.times
-    of = [next(part for part in parts if k < part.end) for k in readings[:SHOWN]]
-    unit = "" if problem.model.time_unit == "1" else f" {problem.model.time_unit}"
-    told = [
-        f"reading {k - part.begin + 1} of {part.name} (at {times[k]:.6g}{unit})"
-        for k, part in zip(readings, of, strict=False)
-    ]
-    more = f" and {len(readings) - SHOWN} more" if len(readings) > SHOWN else ""
+    times, told = problem.observations.file_times, []
+    for k in readings:
+        part = next(part for part in problem.parts if k < part.end)
+        told.append(f"reading {k - part.begin + 1} of {part.name} (at {clock(problem.model, times[k])})")
     return (
-        f". Too few of them, if any, have a number for {', '.join(told)}{more}: leave such readings out (an empty cell "
-        "of the table, NaN in Python), or narrow the priors to where the model has one"
+        f". Too few of them, if any, have a number for {listed(told, SHOWN, longest=100)}: leave such readings out (an "
+        "empty cell of the table, NaN in Python), or narrow the priors to where the model has one"
     )

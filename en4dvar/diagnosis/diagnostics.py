@@ -100,7 +100,7 @@ def effective_share(log_weights: Array) -> float:
     return float(weights.sum() ** 2 / np.sum(weights**2) / len(weights))
 
 
-def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]:
+def gaussianity(members: Array, centre: Array, costs: Array) -> float:
     """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
 
     ``members`` (N, n) and the ``centre`` (n,) of their Gaussian, transformed; ``costs`` J (N,) of the members. With log
@@ -110,13 +110,22 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
     alive = np.isfinite(costs)
     anomalies = members - centre
     if int(alive.sum()) < members.shape[1] + 2:
-        return {"gaussian_fit": math.nan}
+        return math.nan
     about_mean = members - np.add.reduce(members, axis=0) / len(members)
     scale = np.maximum(about_mean.std(axis=0, ddof=1), np.finfo(float).tiny)  # units differ by many powers of ten
     about_mean, anomalies = about_mean / scale, anomalies / scale
     correlation = about_mean.T @ about_mean / (len(members) - 1)
     squares = np.einsum("ij,ji->i", anomalies, np.linalg.pinv(correlation, hermitian=True) @ anomalies.T)
-    return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
+    return effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))
+
+
+def off(ensemble: Array, mean: Array, std: Array) -> tuple[float, float]:
+    """How far members (N, n) are from this mean and standard deviation (n,): the largest distance of their mean in
+    standard deviations, and the ratio of theirs to these where it is farthest from 1.
+    """
+    ratio = ensemble.std(axis=0, ddof=1) / std
+    shift = np.max(np.abs(ensemble.mean(axis=0) - mean) / std)
+    return float(shift), float(ratio[np.argmax(np.abs(np.log(ratio)))])
 
 
 def is_non_gaussian(shape: Mapping[str, float], doubted: bool = False) -> bool:

@@ -19,12 +19,11 @@ from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.localised import Localised
 from en4dvar.estimation.lost_frame import lost_frame
-from en4dvar.estimation.stages import Sampled, Stages
+from en4dvar.estimation.stages import Sampled, Stages, control_of, values_of
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import TooFewMembersError
-from en4dvar.priors.prior import Prior
 from en4dvar.priors.varying import PiecewiseModel
 from en4dvar.priors.varying.model import clock
 from en4dvar.problem import InverseProblem
@@ -36,6 +35,7 @@ __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 AS_GOOD = 0.5  # of J above that of the problem itself: the data allow the change as well
 INTERVALS = 2.0  # between readings, by which knots are shifted
 HINT, FAR = 3.0, 2.0  # ratio of evidences, and standard deviations that a parameter moves: knots that seem to be missed
+_Mode = tuple[dict[str, float], float]  # physical values where J is lowest, by name, and J there
 
 
 def assimilate(
@@ -203,8 +203,8 @@ def _without_excuse(stages: Stages) -> Array | None:
     searched = scheme and scheme.searches and scheme.economical(stages.space.basis)
     if not (searched and problem.estimates_discrepancy):
         return None
-    held = _errors_held(stages, problem, problem.prior.mean, from_there=False)
-    return held.centre if held else None
+    held = _errors_held(stages, problem, values_of(problem.prior, problem.prior.mean), from_there=False)
+    return control_of(problem.prior, held[0]) if held else None
 
 
 def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> Fit | None:
@@ -215,55 +215,50 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     Both first hold the parameters of R, since a large discrepancy would excuse whatever is missed. Where that leads
     both to one place, the second is a descent from ``at`` that holds nothing.
     """
-    prior, fits, begun = changed.prior, list[Fit](), stages.space.forward_runs
-    held: Fit | None = None
+    values, fits, begun = values_of(changed.prior, at), list[_Mode](), stages.space.forward_runs
+    held: _Mode | None = None
 
-    def descend(place: Array | None) -> None:
-        end = _mode(stages, changed, None if place is None else _named(prior, place))
-        if end:
-            fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, 0))
+    def descend(start: Mapping[str, float] | None) -> None:
+        if end := _mode(stages, changed, start):
+            fits.append(end)
 
     if stages.minimiser:
-        held = _errors_held(stages, changed, at, from_there=True)
-        descend(held.centre if held else at)
-    if not fits or not fits[0].cost < cost + AS_GOOD:
-        wider = _errors_held(stages, changed, at, from_there=False)
-        again = held is not None and wider is not None and abs(wider.cost - held.cost) < SAME_COST
-        descend(at if again else wider.centre if wider else None)
-    best = min(fits, key=lambda fit: fit.cost, default=None)
-    return best and replace(best, runs=stages.space.forward_runs - begun)
+        held = _errors_held(stages, changed, values, from_there=True)
+        descend(held[0] if held else values)
+    if not fits or not fits[0][1] < cost + AS_GOOD:
+        wider = _errors_held(stages, changed, values, from_there=False)
+        again = held is not None and wider is not None and abs(wider[1] - held[1]) < SAME_COST
+        descend(values if again else wider[0] if wider else None)
+    if not fits:
+        return None
+    best, lowest = min(fits, key=lambda fit: fit[1])
+    return Fit(control_of(changed.prior, best), lowest, stages.space.forward_runs - begun)
 
 
-def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> Fit | None:
-    """Where descents lead that hold the parameters of R as in ``at`` (n,), and start there or look from the prior; None
+def _errors_held(
+    stages: Stages, problem: InverseProblem, values: Mapping[str, float], from_there: bool
+) -> _Mode | None:
+    """Where descents lead that hold the parameters of R as in ``values``, and start there or look from the prior; None
     where there is nothing to hold or to descend in, or too few members survive.
     """
-    prior, values = problem.prior, _named(problem.prior, at)
-    errors = {name: x for name, x in values.items() if name in problem.of_errors}
+    prior, errors = problem.prior, {name: x for name, x in values.items() if name in problem.of_errors}
     others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
     if not (errors and others.terms):
         return None
     held = replace(problem, prior=others, fixed={**problem.fixed, **errors})
     end = _mode(stages, held, {name: values[name] for name in others.names} if from_there else None)
-    if end is None:
-        return None
-    values |= dict(zip(others.names, end.centre.tolist(), strict=True))
-    centre = prior.from_physical(np.array([values[name] for name in prior.names]))
-    return Fit(centre, end.iterations[-1].cost, 0)
+    return end and ({**values, **end[0]}, end[1])
 
 
-def _named(prior: Prior, x: Array) -> dict[str, float]:
-    """Physical values, by name, of a control vector (n,)."""
-    return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
-
-
-def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> Analysis | None:
+def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> _Mode | None:
     """The mode of another problem, from a ``start`` or by a search, without what is after it; else :func:`_alone`."""
     problem = replace(problem, observations=replace(problem.observations, continued=None))
     settings = replace(stages.settings, refine="none", emulator="off")
     if stages.minimiser and start:
         settings = replace(settings, own=replace(stages.minimiser, start=start))
-    return _alone(stages, problem, settings)
+    if end := _alone(stages, problem, settings):
+        return dict(zip(problem.prior.names, end.centre.tolist(), strict=True)), end.iterations[-1].cost
+    return None
 
 
 def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> Analysis | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from en4dvar.data.noise import Predicted
 from en4dvar.descent.field import Passes, field_en4dvar
-from en4dvar.descent.field_data import FieldData, Pass, gain_of, mean_of, prior_members
+from en4dvar.descent.field_data import FieldData, Pass, gain_of, moment_of, prior_members
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
 from en4dvar.diagnosis import diagnostics as diag
@@ -63,14 +63,14 @@ class Localised:
 
     def run(self) -> Analysis:
         problem, ensemble, n = self.problem, self.ensemble, self.named
-        before, prior_mean = ensemble[:, :n].copy(), mean_of(ensemble, self.everyone)
+        before, prior_mean = ensemble[:, :n].copy(), moment_of(ensemble, self.everyone)
         base = self._base(prior_mean[:n])
         moments = [self._moments(prior_field, columns, base) for prior_field, columns in self.fields]
         prior_run = filled(self.forecast(ensemble, self.grid), ensemble)
         require_members(problem, prior_run, self.fewest, "prior forecast")
         if not self.settings.stochastic_model:
             check_forecast_repeats(problem, prior_run, lambda some: self.forecast(ensemble[some], self.grid))
-        variance = self._variance()
+        variance = moment_of(ensemble, self.everyone, np.var)
         centre, converged, stop, lost = self._descend(prior_run)
         run = filled(self.forecast(ensemble, self.grid), ensemble)
         central = self.forecast(centre[None])
@@ -137,7 +137,7 @@ class Localised:
             raise TooFewMembersError(f"{observations.name}: {error}. Most frequent reasons: {reasons}") from None
         for i in set(self.everyone.tolist()) - set(passes.alive.tolist()):
             lost[i] = prior_run.failures[i] or f"failed in a pass of {settings.scheme}"
-        return mean_of(ensemble, passes.alive), True, counted(len(inflations), "assimilation"), lost
+        return moment_of(ensemble, passes.alive), True, counted(len(inflations), "assimilation"), lost
 
     def _predict(self, members: Array) -> Array:
         run = self.forecast(members)
@@ -184,14 +184,9 @@ class Localised:
             dfs = float(np.sum(np.minimum(observations.weights[used] * leverage, 1.0)))
             at = central.predictions[0, used]
             self._heard(Pass(centre, at, lambda part: self.ensemble[alive, part], share=0.0, dfs=dfs))
-        after = self._variance(alive)
+        after = moment_of(self.ensemble, np.flatnonzero(alive), np.var)
         spread = float(np.sqrt(np.mean(after / variance)))
         self.records[-1] = replace(self.records[-1], spread=spread, active=int(alive.sum()))
-
-    def _variance(self, which: Array | slice = slice(None)) -> Array:
-        columns = range(self.ensemble.shape[1])
-        step = max(1, PATHS // (8 * len(self.ensemble)))
-        return np.concatenate([self.ensemble[which, i : i + step].var(axis=0) for i in columns[::step]])
 
     def _base(self, named: Array) -> Array:
         """The model's own initial state (n_state,) at the prior mean of the parameters with names."""

@@ -30,11 +30,10 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty.checks import THERE
-from en4dvar.estimation.stages import Stages
+from en4dvar.estimation.stages import Stages, control_of, values_of
 from en4dvar.model.state import TIME_SHIFT, Array, Mask
 from en4dvar.plumbing.caution import Caution, caution, codes
 from en4dvar.plumbing.errors import TooFewMembersError
-from en4dvar.priors.prior import Prior
 from en4dvar.priors.varying.model import clock
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Minimiser
@@ -89,7 +88,7 @@ class _Search:
         problem, prior, o = stages.problem, stages.problem.prior, stages.problem.observations
         assert stages.minimiser is not None
         self.stages, self.own, self.mode = stages, stages.minimiser, mode
-        self.values, usual = _named(prior, mode), {**problem.fixed, **_named(prior, prior.mean)}
+        self.values, usual = values_of(prior, mode), {**problem.fixed, **values_of(prior, prior.mean)}
         self.values |= {name: usual[name] for name in problem.of_errors & {*prior.names}}
         self.values |= {p.name: SMALL * usual[p.name] for p in problem.discrepancy[:1] if p.name in self.values}
         self.free = [j for j, p in enumerate(prior.parameters) if not (p.common or p.name in problem.of_errors)]
@@ -162,16 +161,13 @@ class _Search:
 
     def _shifted(self, x: Array, by: float) -> Array:
         """The same with a clock that takes ``by`` off, where one is estimated."""
-        prior = self.bare.prior
-        values = _named(prior, x)
+        values = values_of(self.bare.prior, x)
         values[TIME_SHIFT.name] = values.get(TIME_SHIFT.name, 0.0) - by
-        return prior.from_physical(np.array([values[name] for name in prior.names]))
+        return control_of(self.bare.prior, values)
 
     def _freed(self, by: float, k: int, at: Array) -> float:
         """J of the problem itself at its minimum, found from where what is free is as in ``at``, or from the mode."""
-        prior = self.stages.problem.prior
-        values = self.values | _named(self.bare.prior, at)
-        start = prior.from_physical(np.array([values[name] for name in prior.names]))
+        start = control_of(self.stages.problem.prior, self.values | values_of(self.bare.prior, at))
         return self._descend(_later(self.stages.problem, by, k), [start, self.mode])[1]
 
     def _gain(self, unmoved: float, costs: Array) -> Array:
@@ -227,8 +223,3 @@ def _quadratic(spaces: Sequence[WeightSpace], x: Array) -> tuple[Array, Array]:
     J, gradient = J + 0.5 * precision * c @ c - o.log_normalisation(), precision * c - slope
     steps = np.linalg.solve(curvature + precision * np.eye(len(c)), gradient[..., None])[..., 0]
     return J, J - 0.5 * np.sum(gradient * steps, axis=1)
-
-
-def _named(prior: Prior, x: Array) -> dict[str, float]:
-    """Physical values, by name, of a control vector (n,)."""
-    return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))

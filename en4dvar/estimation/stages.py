@@ -22,6 +22,7 @@ from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.near_bounds import near_bounds
 from en4dvar.sampling.refine import (
@@ -53,11 +54,14 @@ class Ends:
     central: Forecast
     drawn: Drawn | None = None
 
-    def gaussianity(self, costs: Array) -> dict[str, float]:
-        """Of members of J ``costs`` (N,); of others how well J agrees with what they were drawn from."""
+    def fit(self, space: WeightSpace) -> float:
+        """The effective share of members that stand for the posterior: how well J agrees with what they are drawn from,
+        which is a Gaussian unless they were drawn otherwise.
+        """
+        costs = space.costs(self.members, self.run)
         if self.drawn is None:
             return diag.gaussianity(self.members, self.mode, costs)
-        return {"gaussian_fit": diag.effective_share(self.drawn.cost(self.members) - costs)}
+        return diag.effective_share(self.drawn.cost(self.members) - costs)
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,7 @@ class Stages:
         ends = self.gaussian(outcome.descent)
         if sampling:
             rest = search.rest(outcome)
-            if rest and (len(outcome.minima) > 1 or not self.fit(ends) >= CLEARED):
+            if rest and (len(outcome.minima) > 1 or not ends.fit(space) >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
             outcome, ends = self.rather(search.surveyed(outcome), outcome, ends)
             outcome, ends = self.rather(search.widened(outcome), outcome, ends)
@@ -168,22 +172,18 @@ class Stages:
         if linear is not None:
             if leaning := near_bounds(space, linear, mode, members):
                 near = self.about(mode, leaning.members, leaning)
-                if self.fit(near) >= CLEARED:
+                if near.fit(space) >= CLEARED:
                     return near
             drawn = beside_bounds(space, linear, descent.weights.w, descent.iterate.cost)
             drawn = drawn or over_errors(space, linear, mode, members)
             members = drawn.members if drawn else members
         other = self.about(mode, members, drawn)
-        return near if near and self.fit(near) > self.fit(other) else other
+        return near if near and near.fit(space) > other.fit(space) else other
 
     def about(self, mode: Array, members: Array, drawn: Drawn | None = None) -> Ends:
         """Members (N, n) about a mode (n,), run."""
         final = self.space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:], drawn)
-
-    def fit(self, ends: Ends) -> float:
-        """The effective share of members that stand for the posterior."""
-        return ends.gaussianity(self.space.costs(ends.members, ends.run))["gaussian_fit"]
 
     def sampled(
         self, descent: Descent, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
@@ -202,8 +202,7 @@ class Stages:
             cheap = samples(space)
             # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
             settle = not (cheap and self.problem.discrepancy)
-            costs = space.costs(ends.members, ends.run)
-            shape = examine_shape(space, ends.members, ends.gaussianity(costs), self.seed, settle)
+            shape = examine_shape(space, ends.members, ends.fit(space), self.seed, settle)
             settles = cheap and bool(minima)
             modes = that_count(minima, self.problem.prior, math.log(SEEN))  # of which a warning is given in any case
             told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
@@ -233,3 +232,13 @@ class Stages:
     def tell(self, record: Record) -> None:
         if self.progress is not None:
             self.progress(self.problem.observations.name, record)
+
+
+def values_of(prior: Prior, x: Array) -> dict[str, float]:
+    """Physical values, by name, of a control vector (n,)."""
+    return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
+
+
+def control_of(prior: Prior, values: Mapping[str, float]) -> Array:
+    """The control vector (n,) of physical values by name, which may hold others."""
+    return prior.from_physical(np.array([values[name] for name in prior.names]))

@@ -145,9 +145,9 @@ def short(text: str, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
-def listed(names: Iterable[str], most: int = 30) -> str:
+def listed(names: Iterable[str], most: int = 30, longest: int = 60) -> str:
     """Names with commas between; of many the first, and how many more there are."""
-    known = [short(name) for name in names]
+    known = [short(name, longest) for name in names]
     more = f" and {len(known) - most} more" if len(known) > most else ""
     return f"{', '.join(known[:most])}{more}"
 

@@ -23,11 +23,11 @@ import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
 from en4dvar.data.noise import Predicted
-from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import effective_share
-from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.forecast import Forecast, costs
 from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array, Indices
 from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling.walkers import advance
 
 DEGREES = (3, 2)  # tried in this order
@@ -153,8 +153,8 @@ class Bend:
 
 @dataclass(frozen=True)
 class EmulatedCost:
-    """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``, a polynomial of what
-    ``bend`` makes of them.
+    """Ĵ (B,) of control vectors (B, n): J of a ``problem``, of the predictions (and rates, ln σ) of ``emulator``, a
+    polynomial of what ``bend`` makes of them.
 
     J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
     in there must find its way out. All of the prior at that J_o has about e^−20 of the posterior's probability.
@@ -164,8 +164,7 @@ class EmulatedCost:
 
     emulator: Emulator
     bend: Bend
-    prior: Prior
-    observations: Observations
+    problem: InverseProblem
     make: Predicted
     ceiling: float = math.inf
     share: float = math.nan
@@ -173,8 +172,8 @@ class EmulatedCost:
 
     def cost(self, x: Array) -> Array:
         """Ĵ (B,) of control vectors (B, n)."""
-        observed = self.observations.cost(self.make.unstacked(self.emulator.predictions(self.bend(x))))
-        return np.minimum(observed, self.ceiling) + self.prior.cost(x)
+        observed = self.problem.observations.cost(self.make.unstacked(self.emulator.predictions(self.bend(x))))
+        return np.minimum(observed, self.ceiling) + self.problem.prior.cost(x)
 
     def settled(self, random: np.random.Generator) -> "EmulatedCost":
         """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
@@ -226,7 +225,7 @@ def needed_runs(n_parameters: int) -> tuple[int, int] | None:
 
 
 def emulate(
-    run: Run, prior: Prior, observations: Observations, ensemble: Array, random: np.random.Generator, fits: int = 2
+    run: Run, problem: InverseProblem, ensemble: Array, random: np.random.Generator, fits: int = 2
 ) -> EmulatedCost | None:
     """Ĵ about a Gaussian ensemble (N, n), transformed, with draws of it.
 
@@ -234,42 +233,42 @@ def emulate(
     before says the posterior is. None where there are too many parameters for polynomials, or so many runs fail that
     the rest does not determine them.
     """
-    n = ensemble.shape[1]
+    prior, n = problem.prior, ensemble.shape[1]
     wanted = needed_runs(n)
     if wanted is None or len(ensemble) <= n:
         return None
     degree, count = wanted
     coordinates = Coordinates.about(ensemble)
-    runs = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
+    runs = _run(run, problem, coordinates.back(random.standard_normal((count, n))))
     if len(runs.x) < ENOUGH_ALIVE * count:
         return None
-    emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
+    emulated = fitted_cost(problem, degree, runs, 2 * n)
     kept, share = runs.x, math.nan
     walkers = kept[random.permutation(len(kept))[:WALKERS]]
     for _ in range(fits - 1):
         positions = emulated.walk(walkers, kept, random, SCATTERED)
         walkers, kept = positions[-1], np.concatenate(positions[SCATTERED // 2 :])
-        new = _run(run, prior, observations, kept[np.linspace(0, len(kept) - 1, count).astype(int)])
+        new = _run(run, problem, kept[np.linspace(0, len(kept) - 1, count).astype(int)])
         if not len(new.x):
             return None
         share = effective_share(emulated.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
         runs = runs.joined(new)
-        emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
+        emulated = fitted_cost(problem, degree, runs, 2 * n)
     settled = emulated.walk(walkers, kept, random, SETTLED)
     narrowed = prior.log_det_root - np.linalg.slogdet(coordinates.root)[1]
     ceiling = float(np.min(runs.costs - prior.cost(runs.x)) + CEILING + max(0.0, narrowed))
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
-def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> ModelRuns:
+def _run(run: Run, problem: InverseProblem, x: Array) -> ModelRuns:
     """Run control vectors (B, n); the survivors."""
     outcome = run(x)
-    return ModelRuns.of(x, outcome, prior.cost(x) + observations.cost(outcome.predicted))
+    return ModelRuns.of(x, outcome, costs(problem, x, outcome))
 
 
-def fitted_cost(prior: Prior, observations: Observations, degree: int, runs: ModelRuns, near: float) -> EmulatedCost:
+def fitted_cost(problem: InverseProblem, degree: int, runs: ModelRuns, near: float) -> EmulatedCost:
     """Ĵ fitted to runs; one whose J exceeds the lowest by ``near`` counts half."""
-    excess, bend = (runs.costs - runs.costs.min()) / near, Bend.of(prior, runs.x)
+    excess, bend = (runs.costs - runs.costs.min()) / near, Bend.of(problem.prior, runs.x)
     x = bend(runs.x)
     emulator = Emulator.fitted(Coordinates.about(x), degree, x, runs.outputs, 1 / (1 + excess**2), RIDGE)
-    return EmulatedCost(emulator, bend, prior, observations, runs.make)
+    return EmulatedCost(emulator, bend, problem, runs.make)

@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.data.observations import Observations
-from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.forecast import Forecast, costs
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.model.state import Array
-from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling.emulated_cost import RUNS_PER_TERM, EmulatedCost, ModelRuns, fitted_cost, needed_runs
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import advance
@@ -39,28 +38,22 @@ LARGEST = 2000  # outputs of a run beyond which emulating them costs more than i
 
 
 class RecordedRuns:
-    """J (B,) of control vectors (B, n) by the model, +inf where that fails; what the runs gave is kept. An emulator of
-    many runs has polynomials up to degree :data:`HIGHEST`.
+    """J (B,) of a problem at control vectors (B, n) by the model, +inf where that fails; what the runs gave is kept. An
+    emulator of many runs has polynomials up to degree :data:`HIGHEST`.
     """
 
-    def __init__(
-        self,
-        run: Callable[[Array], Forecast],
-        costs: Callable[[Array, Forecast], Array],
-        prior: Prior,
-        observations: Observations,
-    ):
-        self._run, self._costs, self.prior, self.observations = run, costs, prior, observations
-        self._wanted = needed_runs(len(prior.names))
+    def __init__(self, run: Callable[[Array], Forecast], problem: InverseProblem):
+        self._run, self.problem, self.prior = run, problem, problem.prior
+        self._wanted = needed_runs(len(problem.prior.names))
         self.runs: ModelRuns | None = None
 
     def __call__(self, x: Array) -> Array:
         outcome = self._run(x)
-        costs = self._costs(x, outcome)
+        J = costs(self.problem, x, outcome)
         if outcome.predicted.stacked.shape[1] <= LARGEST:
-            new = ModelRuns.of(x, outcome, costs)
+            new = ModelRuns.of(x, outcome, J)
             self.runs = new if self.runs is None else self.runs.joined(new)
-        return costs
+        return J
 
     @property
     def emulates(self) -> bool:
@@ -76,7 +69,7 @@ class RecordedRuns:
         chosen = np.argsort(self.runs.costs, kind="stable")[: max(fewest, near)]
         while degree < HIGHEST and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
             degree += 1
-        return fitted_cost(self.prior, self.observations, degree, self.runs[chosen], n * heat)
+        return fitted_cost(self.problem, degree, self.runs[chosen], n * heat)
 
 
 @dataclass(frozen=True)

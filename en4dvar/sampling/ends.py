@@ -81,8 +81,7 @@ class _Walk:
         near = self.runs[np.flatnonzero(self.runs.costs - self.runs.costs.min() < NEAR)]
         degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(near.x)), None)
         if degree and near.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
-            prior, observations = self.space.problem.prior, self.space.problem.observations
-            emulated = fitted_cost(prior, observations, degree, near, 2 * n)
+            emulated = fitted_cost(self.space.problem, degree, near, 2 * n)
             x, log_volume, lowest = self._lowest(emulated, x, self.about[sides])
             expected = emulated.cost(x)
         costs = self._run(x)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.diagnosis.analysis import ChainRecord
+from en4dvar.diagnosis.diagnostics import off
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.sampling.alike import LEAST, POOL, standing_for
@@ -45,9 +46,8 @@ ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start
 class Chain:
     """The sampler's output: ``samples`` (steps, walkers, n) after burn-in and the numbers that judge it.
 
-    ``r_hat`` and ``effective`` (n,) are split R-hat and effective sample size; ``moved`` (n,) is the change of the
-    mean against the ensemble it started from in posterior standard deviations, ``widened`` (n,) the ratio of the
-    standard deviations.
+    ``r_hat`` and ``effective`` (n,) are split R-hat and effective sample size; ``off`` is how far the ensemble that it
+    started from is from it (:func:`~en4dvar.diagnosis.diagnostics.off`).
     """
 
     samples: Array
@@ -57,8 +57,7 @@ class Chain:
     acceptance: float
     steps: int
     converged: bool
-    moved: Array
-    widened: Array
+    off: tuple[float, float]
 
     @property
     def flat(self) -> Array:
@@ -93,8 +92,8 @@ class Chain:
             "mcmc_r_hat": float(np.max(self.r_hat)),
             "mcmc_effective_sample_size": float(np.min(self.effective)),
             "mcmc_converged": self.converged,
-            "mcmc_largest_shift": float(np.max(np.abs(self.moved))),
-            "mcmc_largest_spread_ratio": float(np.exp(np.max(np.abs(np.log(self.widened))))),
+            "mcmc_largest_shift": self.off[0],
+            "mcmc_largest_spread_ratio": max(self.off[1], 1 / self.off[1]),
         }
 
 
@@ -151,7 +150,6 @@ def _judged(sampler: Any, target: float, ensemble: Array) -> Chain:
     samples = sampler.get_chain()[int(BURN_IN * steps) :]
     r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
     flat = samples.reshape(-1, ensemble.shape[1])
-    spread = flat.std(axis=0)
     return Chain(
         samples=samples,
         log_density=sampler.get_log_prob()[-len(samples) :],
@@ -160,8 +158,7 @@ def _judged(sampler: Any, target: float, ensemble: Array) -> Chain:
         acceptance=float(np.mean(sampler.backend.accepted / steps)),
         steps=steps,
         converged=bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)),
-        moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
-        widened=spread / ensemble.std(axis=0, ddof=1),
+        off=off(ensemble, flat.mean(axis=0), flat.std(axis=0)),
     )
 
 

@@ -28,7 +28,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.linalg import resampled, shares_of
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
@@ -58,20 +58,18 @@ STILL_REACHING = "each round of draws reached farther along the posterior than t
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
-def examine_shape(
-    space: WeightSpace, ensemble: Array, shape: Mapping[str, float], seed: int, settle: bool = True
-) -> dict[str, float]:
+def examine_shape(space: WeightSpace, ensemble: Array, fit: float, seed: int, settle: bool = True) -> dict[str, float]:
     """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
 
-    Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
+    Of the ``ensemble`` (N, n), transformed; ``fit``, the effective share of its members, is ``gaussian_fit`` of them.
     Deterministic in ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
     Where an emulator was needed there are ``mean_shift``, the largest distance of the ensemble's mean from the
     posterior's in posterior standard deviations, ``spread_ratio``, the standard deviation of the ensemble over the
     posterior's where that is farthest from 1, ``emulator_fit``, and
     ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
     """
-    numbers = dict(shape)
-    if shape["gaussian_fit"] < CLEARED:
+    numbers = {"gaussian_fit": fit}
+    if fit < CLEARED:
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
             off = _off(emulator, ensemble)
@@ -83,7 +81,7 @@ def examine_shape(
             for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
                 numbers |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
     doubted = any(walk.spread for walk in space.problem.walks)
-    doubted |= bool(space.settings.own.approximate) and shape["gaussian_fit"] < CLEARED
+    doubted |= bool(space.settings.own.approximate) and fit < CLEARED
     return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, doubted)}
 
 
@@ -203,21 +201,15 @@ def doubtful(shape: Mapping[str, float]) -> bool:
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
     """How far an ensemble (N, n) is from the emulator's draws."""
-    draws = emulator.draws
-    std = draws.std(axis=0)
-    ratio = ensemble.std(axis=0, ddof=1) / std
-    return {
-        "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
-        "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
-    }
+    shift, ratio = diag.off(ensemble, emulator.draws.mean(axis=0), emulator.draws.std(axis=0))
+    return {"mean_shift": shift, "spread_ratio": ratio}
 
 
 def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> EmulatedCost | None:
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     if not _emulates(space.problem, space.settings):
         return None
-    random = member_stream(seed, "emulator")
-    return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random, fits)
+    return emulate(space.forecast, space.problem, ensemble, member_stream(seed, "emulator"), fits)
 
 
 def _emulates(problem: InverseProblem, settings: AssimilationSettings) -> bool:
@@ -277,7 +269,7 @@ def mode_cautions(
     most = int(np.argmax(distances))
     p = prior.parameters[most]
     at = " and ".join(f"{convert(float(m.centre[most]), p.unit, p.display_unit):.3g}" for m in seen)
-    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    unit = unit_after(p.display_unit)
     drawn = "members are drawn from all of them" if result else "members describe only the first"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
     if result and not np.any(distances > APART):
@@ -357,7 +349,7 @@ def refined(
     below = minima[0].cost - MISSED if looking and minima else -math.inf
     draws = None
     if len(minima) > 1 or not chain:  # the runs of these draws are kept; those of a chain would be too many
-        recorded = RecordedRuns(space.forecast, space.costs, prior, space.problem.observations)
+        recorded = RecordedRuns(space.forecast, space.problem)
         drawn_by = cost if space.settings.emulator == "off" else recorded
         draws = sample_modes(drawn_by, prior, minima, seed, enough, below)
     if draws is not None and draws.lowest < below:
@@ -369,7 +361,7 @@ def refined(
         own = _own_draws(draws.x, draws.shares, draws.mode, draws.costs, len(minima))
         told = () if draws.settled else (caution("chain-not-converged", STILL_REACHING),)
         return Refined(members, summary, own, draws.log_evidence, draws.lowest, draws=kept, warnings=told)
-    several = draws is not None and len(minima) > 1
+    several = len(minima) > 1  # then there are draws
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)
     walked = mcmc.sample(
@@ -379,17 +371,16 @@ def refined(
         target=enough,
         look=look,
         emulated=emulated,
-        proposal=draws.proposal if several and draws is not None else None,
+        proposal=draws.proposal if draws and several else None,
     )
     equal = np.full(len(walked.flat), 1 / len(walked.flat))
     for_one = max(1.0, len(equal) / float(walked.effective.min()))
     mode = belonging(prior, minima, walked.flat, equal, for_one)
-    known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),
         walked.summary(),
         _own_draws(walked.flat, equal, mode, -walked.log_density.ravel(), len(minima)),
-        draws.log_evidence if draws is not None and known else math.nan,
+        draws.log_evidence if draws and draws.effective >= TOO_FEW else math.nan,
         float(-walked.log_density.max()),
         walked.flat[np.argmax(walked.log_density)],
         warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
@@ -420,12 +411,10 @@ def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:
 
 def _summary(draws: WeightedDraws, posterior: Array) -> dict[str, float]:
     """The numbers that judge weighted draws, and how far they are from the ensemble they replace, for the result."""
-    std = np.sqrt(np.diag(draws.covariance))
-    moved = (draws.mean - posterior.mean(axis=0)) / std
-    widened = np.log(std / posterior.std(axis=0, ddof=1))
+    shift, ratio = diag.off(posterior, draws.mean, np.sqrt(np.diag(draws.covariance)))
     return {
         "importance_draws": len(draws.x),
         "importance_effective_sample_size": draws.effective,
-        "importance_largest_shift": float(np.max(np.abs(moved))),
-        "importance_largest_spread_ratio": float(np.exp(np.max(np.abs(widened)))),
+        "importance_largest_shift": shift,
+        "importance_largest_spread_ratio": max(ratio, 1 / ratio),
     }

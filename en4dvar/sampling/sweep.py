@@ -221,7 +221,7 @@ def run_sweep(
     one has several series. DataError: no trajectory fits a set; readings are all alike, or one would be compared before
     ``earliest``; the step is far too small.
     """
-    executor = executor or SerialExecutor()
+    executor, told = executor or SerialExecutor(), progress or (lambda done, total: None)
     mean, std = _moments(problems)
     with retold(ValueError, DataError):
         most = LARGEST / BATCH / problems[0].model.layout.size
@@ -240,14 +240,12 @@ def run_sweep(
     for i, best in executor.results(score.chunk, list(zip(parts, files, strict=True))):
         best_of_set[i] = best
         done += len(parts[i])
-        if progress is not None:
-            progress(done, total)
+        told(done, total)
     best = reduce(Best.merged, (best_of_set[i] for i in range(len(parts))))
     for count, refined in _refined(score, best, settings, seed, executor):
         best = refined
         done += count
-        if progress is not None:
-            progress(done, total)
+        told(done, total)
     names = tuple(p.observations.name for p in problems)
     lost = [name for name, value in zip(names, best.nrmse, strict=True) if not math.isfinite(value)]
     if lost:

@@ -69,4 +69,4 @@ class ESMDA(ETKF):
         if self.mda_form == "square-root":
             return Step(Weights(w, hessian.transform @ weights.T), norm)
         noise = draw(f"ES-MDA {iteration}")
-        return Step(Weights(w, perturbed_transform(hessian, S, noise, weights.T)), norm)
+        return Step(Weights(w, perturbed_transform(hessian, S, noise) @ weights.T), norm)

@@ -69,24 +69,21 @@ class EnKF(ETKF):
     perturbs = True
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        hessian, n = Hessian.of(evaluation.S), len(weights.w)
+        hessian = Hessian.of(evaluation.S)
         shift = hessian.solve(evaluation.d @ evaluation.S)
-        noise = draw("perturbed observations")
-        if len(evaluation.S) < n:
-            innovations = noise - noise.mean(axis=0) - evaluation.S.T
-            transform = cast(Array, LowRank(innovations, hessian.solve(evaluation.S)))  # T = I before
-        else:
-            transform = perturbed_transform(hessian, evaluation.S, noise, weights.T)
-        return Step(Weights(weights.w + shift, transform), hessian.norm(shift))
+        transform = perturbed_transform(hessian, evaluation.S, draw("perturbed observations"))  # T = I before
+        return Step(Weights(weights.w + shift, cast(Array, transform)), hessian.norm(shift))
 
 
-def perturbed_transform(hessian: Hessian, S: Array, noise: Array, T: Array) -> Array:
-    """T (N, N) after an update with whitened anomalies S (K', N) per row of T and perturbations ``noise`` (N, K')."""
+def perturbed_transform(hessian: Hessian, S: Array, noise: Array) -> Array | LowRank:
+    """By what T (N, N) is multiplied in an update with whitened anomalies S (K', N) per row of T and perturbations
+    ``noise`` (N, K').
+    """
     # anomalies of the members' innovations: −S_i of the predictions and the perturbations
     innovations = noise - noise.mean(axis=0) - S.T
     if len(S) < S.shape[1]:  # the cheaper order of the same product
-        return np.asarray(T + innovations @ (hessian.solve(S) @ T))
-    return np.asarray(T + hessian.solve(innovations @ S) @ T)
+        return LowRank(innovations, hessian.solve(S))
+    return np.asarray(np.eye(S.shape[1]) + hessian.solve(innovations @ S))
 
 
 @dataclass(frozen=True)

@@ -35,13 +35,13 @@ Update = Callable[[slice, Array], Array]  # (part of the cells, their anomalies 
 
 @dataclass(frozen=True)
 class Split:
-    """Anomalies (N, K) of predictions along those of what has a place, and of what has none.
+    """Anomalies (N, K) of predictions along those of what has a place, and of what has none, where there is any.
 
     ``related``: what has a place is correlated with what has none, along which ``placed`` has no part.
     """
 
     placed: Array
-    common: Array
+    common: Array | None = None
     related: bool = False
 
     @classmethod
@@ -53,15 +53,15 @@ class Split:
 
     @property
     def whole(self) -> Array:
-        return self.placed + self.common
+        return self.placed if self.common is None else self.placed + self.common
 
 
 @dataclass(frozen=True)
 class ByDistance:
     """``places`` (n, D) of the cells and ``observed`` (K, D) of the observations; the taper is Gaspari & Cohn's.
 
-    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN), for which
-    the predictions ``Y`` are a :class:`Split`, and nothing is tapered of what it explains.
+    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN), and nothing
+    is tapered of what that explains of the predictions.
     """
 
     places: Array
@@ -87,27 +87,26 @@ class ByDistance:
         """Which of the cells have no place."""
         return np.flatnonzero(np.isnan(self.places[:, 0]))
 
-    def between(self, Y: Array | Split, Z: Array | Split) -> Array:
+    def between(self, Y: Split, Z: Split) -> Array:
         """ρ_yy ∘ YᵀZ/(N−1) (K, K), of anomalies of predictions about two points."""
         from scipy.spatial.distance import cdist  # not needed to import the package
 
-        if isinstance(Y, Split) and isinstance(Z, Split):
-            return np.asarray(self.between(Y.placed, Z.placed) + Y.common.T @ Z.common / (len(Y.common) - 1))
-        assert not isinstance(Y, Split)
-        assert not isinstance(Z, Split)
         rho = gaspari_cohn(cdist(self.observed, self.observed), self.radius)
-        return np.asarray(rho * (Y.T @ Z) / (len(Y) - 1))
+        covariance = rho * (Y.placed.T @ Z.placed) / (len(Y.placed) - 1)
+        if Y.common is not None and Z.common is not None:
+            covariance += Y.common.T @ Z.common / (len(Y.common) - 1)
+        return np.asarray(covariance)
 
-    def along(self, part: slice, anomalies: Array, Y: Array | Split, dual: Array) -> Array:
+    def along(self, part: slice, anomalies: Array, Y: Split, dual: Array) -> Array:
         """(ρ_xy ∘ XᵀY/(N−1)) λ as rows (M, m), for λ (M, K)."""
-        cross = self.taper(part) * (anomalies.T @ (Y.placed if isinstance(Y, Split) else Y)) / (len(anomalies) - 1)
-        if isinstance(Y, Split):
+        cross = self.taper(part) * (anomalies.T @ Y.placed) / (len(anomalies) - 1)
+        if Y.common is not None:
             of_common = anomalies.T @ Y.common / (len(anomalies) - 1)
             nowhere = np.isnan(self.places[part])[:, :1]
             cross = np.where(nowhere, of_common, cross + of_common if Y.related else cross)
         return np.asarray(dual @ cross.T)
 
-    def update(self, Y: Array | Split, variance: Array, innovations: Array) -> Update:
+    def update(self, Y: Split, variance: Array, innovations: Array) -> Update:
         """Increments of M members from ``innovations`` (M, K), with anomalies ``Y`` (N, K), error ``variance`` (K,)."""
         dual = cho_solve(cho_factor(self.between(Y, Y) + np.diag(variance)), innovations.T).T
         return lambda part, anomalies: self.along(part, anomalies, Y, dual)
@@ -119,9 +118,9 @@ class ByCorrelation:
 
     threshold: float | None = None
 
-    def update(self, Y: Array, variance: Array, innovations: Array) -> Update:
+    def update(self, split: Split, variance: Array, innovations: Array) -> Update:
         """As :meth:`ByDistance.update`."""
-        n_members = len(Y)
+        Y, n_members = split.whole, len(split.placed)
         least = CHANCE / np.sqrt(n_members) if self.threshold is None else self.threshold
         covariance = Y.T @ Y / (n_members - 1)
         spread = np.sqrt(np.diag(covariance))

@@ -86,10 +86,8 @@ class AssimilationSettings:
     own: Scheme = field(default_factory=En4DVar)
 
     def __init__(self, scheme: str = DEFAULT, **keys: Any) -> None:
-        kinds, before = (
-            schemes.ON_A_WINDOW,
-            keys.pop("own", None),
-        )  # of settings that are changed by dataclasses.replace
+        kinds = schemes.ON_A_WINDOW
+        before = keys.pop("own", None)  # of settings that are changed by dataclasses.replace
         if before is not None and is_file_reference(scheme):  # which a worker has not read
             kinds.setdefault(scheme, type(before))
         require_usable(scheme)

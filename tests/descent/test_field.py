@@ -13,7 +13,7 @@ from en4dvar.descent.field import field_en4dvar, field_esmda
 from en4dvar.descent.field_data import FieldData
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.local_gain import ByCorrelation, ByDistance
+from en4dvar.schemes.local_gain import ByCorrelation, ByDistance, Split
 from en4dvar.schemes.localisation import gaspari_cohn
 
 
@@ -144,7 +144,8 @@ def many(seed: int):
 class Everything:
     """The gain of the ensemble as it is."""
 
-    def update(self, Y, variance, innovations):
+    def update(self, split, variance, innovations):
+        Y = split.placed
         dual = np.linalg.solve(Y.T @ Y / (len(Y) - 1) + np.diag(variance), innovations.T).T
         return lambda part, anomalies: dual @ (Y.T @ anomalies) / (len(Y) - 1)
 
@@ -264,7 +265,7 @@ def test_by_correlation_each_cell_has_its_own_readings():
     Y = rng.standard_normal((20, 14)) + np.linspace(0, 3, 14) * common
     X, Y = ensemble - ensemble.mean(axis=0), Y - Y.mean(axis=0)
     variance, innovations = rng.uniform(0.2, 1.0, 14), rng.standard_normal((5, 14))
-    found, counts = ByCorrelation(0.5).update(Y, variance, innovations)(slice(0, 40), X), []
+    found, counts = ByCorrelation(0.5).update(Split(Y), variance, innovations)(slice(0, 40), X), []
     for j in range(40):
         near = np.array([abs(np.corrcoef(X[:, j], Y[:, k])[0, 1]) > 0.5 for k in range(14)])
         own = np.cov(Y[:, near].T).reshape(near.sum(), near.sum()) + np.diag(variance[near])

@@ -142,9 +142,11 @@ def test_a_run_that_ends_for_a_reading_that_too_few_members_have_names_it(most):
         return y
 
     _, problem = patchy(Vectorised(NAMES), TRUTH, operator=lacking)
-    time = problem.observations.times[3]
+    problem.model.time_display_unit = "ms"
+    problem = replace(problem, observations=replace(problem.observations, zero=0.5))
+    time = 1e3 * (problem.observations.times[3] + 0.5)  # of the file, as the file's times are shown
     with pytest.raises(
-        TooFewMembersError, match=rf"if any, have a number for reading 4 of y \(at {time:.6g} s\): leave"
+        TooFewMembersError, match=rf"if any, have a number for reading 4 of y \(at {time:.6g} ms\): leave"
     ):
         assimilate(problem, settings(), 1)
     problem = replace(problem, observable=Observable("y", "m", lambda path: np.full(len(path["y"]), np.nan)))

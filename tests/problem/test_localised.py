@@ -20,7 +20,7 @@ from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm, member_stream
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.local_gain import ByCorrelation
+from en4dvar.schemes.local_gain import ByCorrelation, Split
 from en4dvar.schemes.localisation import gaspari_cohn
 from en4dvar.schemes.settings import AssimilationSettings, Localisation
 
@@ -176,7 +176,8 @@ def test_by_correlation_is_the_adaptive_gain_in_each_pass():
     cells = prior_of(problem)
     before = np.column_stack([problem.prior.sample(N, SEED, "exact"), cells])
     Y = 2.0 + cells[:, READ]
-    update = ByCorrelation(0.4).update(Y - Y.mean(axis=0), np.full(6, STD**2), VALUES + errors("ES-MDA 0", 6) - Y)
+    innovations = VALUES + errors("ES-MDA 0", 6) - Y
+    update = ByCorrelation(0.4).update(Split(Y - Y.mean(axis=0)), np.full(6, STD**2), innovations)
     after = before + update(slice(0, 31), before - before.mean(axis=0))
     assert found.posterior == pytest.approx(after[:, :1], abs=1e-10)
     assert found.fields[0].members == pytest.approx(2.0 + after[:, 1:], abs=1e-10)

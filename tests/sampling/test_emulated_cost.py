@@ -42,7 +42,7 @@ def emulated(problem, seed=0, members=40):
         (members, len(problem.prior.names))
     )
     random = np.random.default_rng(seed)
-    return emulate(lambda x: forecast(problem, x), problem.prior, problem.observations, ensemble, random)
+    return emulate(lambda x: forecast(problem, x), problem, ensemble, random)
 
 
 def assert_emulated(emulator, problem, x):
@@ -86,7 +86,7 @@ def test_walkers_stay_where_data_narrow_a_lot():
     assert np.sum(np.log(prior.std)) - 0.5 * np.linalg.slogdet(covariance)[1] > 40
     random = np.random.default_rng(2)
     ensemble = mean + random.standard_normal((48, 6)) @ np.linalg.cholesky(covariance).T
-    made = emulate(lambda x: forecast(problem, x), prior, problem.observations, ensemble, random)
+    made = emulate(lambda x: forecast(problem, x), problem, ensemble, random)
     apart = (made.settled(np.random.default_rng(5)).draws - mean) / stds
     assert np.abs(apart).max() < 6
     assert apart.mean(axis=0) == pytest.approx(np.zeros(6), abs=0.15)

@@ -47,7 +47,7 @@ class Valley:
 
     @property
     def recorded(self):
-        return RecordedRuns(self.run, self.costs, self.prior, self.observations)
+        return RecordedRuns(self.run, self)
 
     @property
     def about(self):

@@ -19,6 +19,7 @@ from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.hints import counted, listed, percent
 from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying.model import clock
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
 NEAR = 0.05  # of the width of an interval
@@ -155,9 +156,7 @@ def missed(analysis: Analysis) -> Findings:
 
 def moments(analysis: Analysis) -> list[str]:
     """The times (K,) of all observations on the clock of the data, in the display unit."""
-    model = analysis.problem.model
-    times = convert(analysis.observations.file_times, model.time_unit, model.time_display_unit)
-    return [f"{time:.6g}{unit_after(model.time_display_unit)}" for time in times]
+    return [clock(analysis.problem.model, time) for time in analysis.observations.file_times]
 
 
 def _chance(probability: float) -> str:

@@ -57,6 +57,7 @@ def examine(
         dfs = n_used - degrees
     of_events = n_used == len(a.problem.observations) and all(part.observable.event for part in a.problem.parts)
     whole = control.costs is not None  # the ensembles stand for the whole covariance
+    wide = enough(prior, control.centre, control.posterior[alive]) if whole else None
     warnings = (
         *earlier,
         *a.problem.observations.doubts,
@@ -73,7 +74,7 @@ def examine(
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
         *other_assumptions(a),
-        *(conflict(a, control, alive) if whole else ()),
+        *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing, wide) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
@@ -133,13 +134,6 @@ def _validity(a: Analysis, alive: Mask) -> checks.Findings:
         which, leverage = residuals.which, residuals.leverage
     if limits:
         yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
-
-
-def conflict(a: Analysis, control: ControlEnsembles, alive: Mask) -> checks.Findings:
-    """Of the minimum and the prior."""
-    timed = a.observations.noise.timed and not a.timing
-    prior, centre = a.problem.prior, control.centre
-    return checks.conflict(prior, centre, timed, enough(prior, centre, control.posterior[alive]))
 
 
 def other_assumptions(analysis: Analysis) -> checks.Findings:

@@ -31,6 +31,7 @@ from en4dvar.estimation.joint.descent import Place
 from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.hints import listed
 from en4dvar.problem import InverseProblem
 
 ODD = 0.01  # probability below which an experiment is odd, that any of a campaign be so by chance
@@ -200,9 +201,9 @@ def left_out(
         for e in odd
     ]
     verb, them = ("does", "it") if len(odd) == 1 else ("do", "them")
-    words = f"{_several(told)} {verb} not share the values of the others"
+    words = f"{listed(told, MOST_NAMES, longest=200)} {verb} not share the values of the others"
     yield caution("odd-data-set", f"{words}: the shared values quoted first are those without {them}", "serious")
-    without = _several([joint.names[e] for e in odd])
+    without = listed((joint.names[e] for e in odd), MOST_NAMES)
     yield from (replace(c, words=f"without {without}: {c.words}") for c in rest)
 
 
@@ -226,8 +227,8 @@ def _misfits(joint: JointProblem, chi2: Array) -> Iterator[Caution]:
         if chi2[e] * readings > chi2_interval(max(1.0, readings - len(joint.columns(e)[1])))[1]:
             beyond.append(f"{joint.names[e]} ({chi2[e]:.3g})")
     if beyond:
-        words = f"χ² per reading under the shared values is larger than the errors explain: {_several(beyond)}"
-        yield caution("misfit", words)
+        words = "χ² per reading under the shared values is larger than the errors explain"
+        yield caution("misfit", f"{words}: {listed(beyond, MOST_NAMES, longest=200)}")
 
 
 def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> Iterator[Caution]:
@@ -253,11 +254,6 @@ def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> It
 
 def _in_figures(value: float) -> str:
     return f"{value:.1g}" if value > LEAST else f"below {LEAST:.0g}"
-
-
-def _several(words: Sequence[str]) -> str:
-    more = f" and {len(words) - MOST_NAMES} more" if len(words) > MOST_NAMES else ""
-    return ", ".join(words[:MOST_NAMES]) + more
 
 
 def trends(problems: Sequence[InverseProblem], values: Array, names: Sequence[str]) -> Iterator[Caution]:

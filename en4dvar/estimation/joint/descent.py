@@ -37,8 +37,8 @@ class Arrow:
         [ B_1ᵀ C_1       ]        x  = S⁻¹ (a − Σ_e B_e C_e⁻¹ b_e)
         [ …          C_E ]        y_e = C_e⁻¹ (b_e − B_eᵀ x)
 
-    ``border`` A (c, c); for each of E experiments ``edges`` B_e (c, n_e) and ``blocks`` C_e (n_e, n_e). c and any n_e
-    may be 0. The cost grows with the number of blocks, not with its square.
+    ``border`` A (c, c); for each of E experiments ``edges`` B_e (c, n_e) and ``blocks`` C_e (n_e, n_e). Any n_e may be
+    0. The cost grows with the number of blocks, not with its square.
     """
 
     border: Array
@@ -55,13 +55,13 @@ class Arrow:
     def log_determinant(self) -> float:
         """ln det of the whole matrix."""
         own = sum(2 * float(np.log(np.diag(factor[0])).sum()) for factor in self._factors)
-        return own + float(np.linalg.slogdet(self.schur)[1] if len(self.border) else 0.0)
+        return own + float(np.linalg.slogdet(self.schur)[1])
 
     def solve(self, a: Array, b: Sequence[Array]) -> tuple[Array, list[Array]]:
         """x (c,) and y_e (n_e,) for the right-hand side a (c,), b_e (n_e,)."""
         passed = (edge @ self._solve(e, b[e]) for e, edge in enumerate(self.edges))
         a = a - sum(passed, start=np.zeros_like(a))
-        x = np.asarray(np.linalg.solve(self.schur, a)) if len(a) else a
+        x = np.asarray(np.linalg.solve(self.schur, a))
         return x, [self._solve(e, b[e] - edge.T @ x) for e, edge in enumerate(self.edges)]
 
     def sample(self, border: Array, own: Callable[[int], Array]) -> tuple[Array, list[Array]]:
@@ -74,9 +74,7 @@ class Arrow:
 
         Raises ValueError: N is not larger than c + n_e.
         """
-        x = whiten_sample(border)
-        if x.shape[1]:
-            x = solve_triangular(np.linalg.cholesky(self.schur).T, x.T).T
+        x = solve_triangular(np.linalg.cholesky(self.schur).T, whiten_sample(border).T).T
         return x, [self._own(e, edge, x, border, own(e)) for e, edge in enumerate(self.edges)]
 
     def _own(self, e: int, edge: Array, x: Array, border: Array, numbers: Array) -> Array:

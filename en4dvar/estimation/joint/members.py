@@ -105,7 +105,7 @@ def sampled(
         weights = shares_of(log_weights)
         effective = effective_number(weights)
         tell(f"{effective:.0f} effective draws after {number + 1} of at most {ROUNDS} rounds, {ENOUGH:.0f} are wanted")
-        if (number + 1 >= LEAST and effective >= ENOUGH) or not border.shape[1]:
+        if number + 1 >= LEAST and effective >= ENOUGH:
             break
         if of_shared := _moments(border[alive], log_weights[alive]):
             proposal = Proposal(of_shared[0], np.asarray(np.linalg.inv(2 * of_shared[1])))
@@ -114,7 +114,7 @@ def sampled(
             of_own[e] = _moments(off[alive].reshape(log_own.size, off.shape[2]), log_own.ravel())
     if effective < FEWEST:
         return None
-    order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
+    order = np.argsort(border[:, 0], kind="stable")
     taken = order[resampled(weights[order], count, stream)]
     own_members = tuple(
         np.concatenate([own[i, resampled(shares_of(log[i]), 1, stream)] for i in taken])  # one each, by their weights

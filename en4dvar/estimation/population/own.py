@@ -25,7 +25,6 @@ soft gel, and a θ that makes all of them stiffer would make them more alike.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +32,7 @@ from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.diagnosis.response.ledger import weighted_quantiles
-from en4dvar.ensemble.forecast import Composite, costs
+from en4dvar.ensemble.forecast import Composite
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.population.following import Following, bent, following_of
@@ -220,13 +219,12 @@ def own_draws(
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
     """
-    prior, observations = problem.prior, problem.observations
+    prior, seed = problem.prior, own_seed(seed, problem.observations.name)
     composite = Beside(Composite(problem, executor), prior, BESIDE)
-    seed = own_seed(seed, observations.name)
     x = prior.from_white(start)
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
-    runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
+    runs = RecordedRuns(composite, problem)
     draws, stream = sample_modes(runs, prior, [about], seed, enough), member_stream(seed, "population: kept draws")
     z = prior.white(draws.x[resampled(draws.shares, KEPT, stream)])
     emulated = emulate and _emulated(runs, z, stream)
