@@ -79,10 +79,8 @@ class Background:
         """The background as a frame shows it, where the camera drifts."""
         if self.drift is None:
             return self
-        down, across = shift_at(self.drift, number)
-        level, gain = (np.roll(part, (down, across), (0, 1)) for part in (self.level, self.gain))
-        gain[: max(down, 0)] = gain[:, : max(across, 0)] = np.nan
-        gain[len(gain) + min(down, 0) :] = gain[:, gain.shape[1] + min(across, 0) :] = np.nan
+        shift = shift_at(self.drift, number)
+        level, gain = (ndimage.shift(part, shift, order=0, cval=np.nan) for part in (self.level, self.gain))
         return replace(self, level=level, gain=gain)
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
@@ -140,13 +138,10 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     nearest = tuple(ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True))
     drift = drift_of([frame[nearest] for frame in samples], numbers)  # what is burnt in does not drift
     if drift is not None:
-        unseen = np.any([np.roll(unseen, np.negative(shift_at(drift, n)), (0, 1)) for n in numbers], axis=0)
+        back = [np.negative(shift_at(drift, n)) for n in numbers]
+        unseen = np.any([ndimage.shift(unseen, shift, order=0, cval=1) for shift in back], axis=0)  # by some frames
         leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
-        samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
-        height, width = first.shape
-        (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
-        # at the border is what only some frames show
-        unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
+        samples = [np.roll(f, shift, (0, 1)) for f, shift in zip(samples, back, strict=True)]
     of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
     leading = leading[(flashed := flashes_first(leading, samples)) :]
     first = leading[0].astype(np.float32)
