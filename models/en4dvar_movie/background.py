@@ -171,8 +171,7 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         patches, sizes = labelled(part)
         middles = ndimage.center_of_mass(part, patches, range(1, len(sizes)))
         at = " and ".join(f"{x:.0f},{y:.0f}" for y, x in middles)
-        words = f"{movie.path}: what {what} about {at} (x,y) in all frames is no bubble and is not looked at"
-        movie.notes.extend([words] * (at != "" and words not in movie.notes))
+        movie.note(f"what {what} about {at} (x,y) in all frames is no bubble and is not looked at", at != "")
     if empty > 2:
         noise = pixel_noise(np.array([f - level for f in leading[:empty]]), unit) * (empty / (empty - 1)) ** 0.5
     background = _with_sign(level, samples, noise, empty and flashed + empty, blind, unit)

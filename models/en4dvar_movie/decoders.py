@@ -190,7 +190,7 @@ def video_frames(path: Path) -> Iterator[Any]:
             if not 0 <= number < told - 1:
                 raise
         if number + 1 < told:
-            yield f"{path}: the file is cut off: it says that it holds {told} frames, {number + 1} are there"
+            yield f"the file is cut off: it says that it holds {told} frames, {number + 1} are there"
 
 
 def _count(file: Any, stream: Any) -> int:
