@@ -378,12 +378,11 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     """
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)
-    y, x = np.mgrid[: total.shape[0], : total.shape[1]]
     for _, image, places in _steadied(background, samples):
         near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
         quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
-            quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
+            quiet &= circle.off(quiet.shape) > 0.3 * circle.R + 10
         total[quiet] += (background.level + image / background.gain)[quiet]  # at the lamp's brightness of the level
         count[quiet] += 1
     level = total / count
@@ -418,7 +417,7 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             shown.append((image, outlines[0]))
-            clipped.append(float(np.mean(frame[outlines[0].circle.beside(frame.shape, AROUND)] > full)))
+            clipped.append(float(np.mean(frame[np.abs(outlines[0].circle.off(frame.shape)) < AROUND] > full)))
     if not shown:
         raise DataError(
             f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
