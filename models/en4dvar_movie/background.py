@@ -111,9 +111,9 @@ class Background:
 
         What is darker than half the ``contrast`` of a bubble is another, or something else before the light.
         """
-        down, across = (TILE * np.arange(side) - at for side, at in zip(tiles.shape, (bubble.y, bubble.x), strict=True))
+        far = Circle(bubble.x / TILE, bubble.y / TILE, (1.4 * bubble.R + 8) / TILE).off(tiles.shape) > 0
         lit = ndimage.uniform_filter(tiles, 3, mode="nearest") > contrast / 2
-        outside = tiles[(np.add.outer(down**2, across**2) > (1.4 * bubble.R + 8) ** 2) & lit]
+        outside = tiles[far & lit]
         if len(outside) < 0.05 * tiles.size:
             return image
         change = np.float32(np.median(outside[:: -(-len(outside) // STEADY)]))
@@ -424,22 +424,17 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
     optics = _shared([o for _, o in shown], background.noise)
-    grey = float(np.nanmedian(np.abs(1 / background.gain)))
-    optics = with_hidden(optics, samples, float(np.median(clipped)), grey)
     clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
     values = np.array([o.rim for o in rims]).reshape(-1, 3)
     heights = values[:, 0] * DENSITY / np.hypot([o.width for o in rims], values[:, 2])
-    if not rims or np.median(heights) - _scatter(heights) < THRESHOLD:
-        return optics
-    rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
-    rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
-    return (
-        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden, hides=optics.hides)
-        if rimmed
-        else optics
-    )
+    if rims and np.median(heights) - _scatter(heights) >= THRESHOLD:
+        rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
+        if rimmed := _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles):
+            optics = replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std)
+    grey = float(np.nanmedian(np.abs(1 / background.gain)))
+    return with_hidden(optics, samples, float(np.median(clipped)), grey)
 
 
 def _again(shown: Sequence[tuple[Frame, Outline]], optics: Optics, circles: int) -> list[Outline]:
