@@ -243,8 +243,7 @@ def _changed(frame: Frame, other: Frame, noise: float, side: int = 5) -> Mask:
 def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     """Where something low changes all the time (H, W), brighter here and darker there at once: time stamps."""
     none = np.zeros(leading[0].shape, dtype=bool)
-    steps = len(leading) - 1
-    if steps < LEAST_PAIRS:
+    if len(leading) <= LEAST_PAIRS:
         return none
     frames = [frame.astype(np.float32) for frame in leading]
     changes = [_changed(b, a, noise, 3) for a, b in pairwise(frames)]
