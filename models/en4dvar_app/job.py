@@ -32,7 +32,7 @@ def start(root: Path, step: str, subject: str, words: list[str], trust: bool) ->
     jobs = inside(root, JOBS)
     try:
         jobs.mkdir(exist_ok=True)
-        number = 1 + max(map(int, _names(jobs)), default=0)
+        number = 1 + max(_numbers(jobs), default=0)
         job = jobs / str(number)
         job.mkdir()
     except FileExistsError:
@@ -53,8 +53,7 @@ def start(root: Path, step: str, subject: str, words: list[str], trust: bool) ->
 def every(root: Path, most: int = 40) -> list[dict[str, Any]]:
     """The last jobs of a folder, the oldest first: command line, output, state (running, done, failed or stopped)."""
     jobs = inside(root, JOBS)
-    numbers = sorted(map(int, _names(jobs)))[-most:]
-    return [about for number in numbers if (about := _described(jobs / str(number)))]
+    return [about for number in _numbers(jobs)[-most:] if (about := _described(jobs / str(number)))]
 
 
 def cancel(root: Path, number: int) -> None:
@@ -62,9 +61,9 @@ def cancel(root: Path, number: int) -> None:
     write_text(inside(root, f"{JOBS}/{number}/cancel"), "")
 
 
-def _names(jobs: Path) -> list[str]:
+def _numbers(jobs: Path) -> list[int]:
     names = os.listdir(jobs) if jobs.is_dir() else []
-    return [name for name in names if name.isascii() and name.isdecimal() and len(name) < 9]
+    return sorted(int(name) for name in names if name.isascii() and name.isdecimal() and len(name) < 9)
 
 
 def _described(job: Path) -> dict[str, Any] | None:

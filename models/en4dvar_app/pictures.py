@@ -4,8 +4,6 @@ import csv
 import io
 import re
 import threading
-from collections import OrderedDict
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,37 +26,32 @@ class Pictures:
 
     def __init__(self, path: Path, raw: str | None = None):
         self.movie: Movie = open_movie(path, raw)
-        self._frames: Iterator[Frame] = iter(())
-        self._next = 0
-        self._held: OrderedDict[int, int] = OrderedDict()  # place of a frame in the room
-        self._room: Frame | None = None  # one block: what threads allocate by themselves grows without end
-        self._range: tuple[float, float] | None = None
+        self._frames, self._next = self.movie.frames(), 1
+        first = next(self._frames)
+        self.shape: tuple[int, ...] = first.shape
+        self._range = float(first.min()), float(first.max())
+        # one block: what threads allocate by themselves grows without end
+        self._room = np.empty((max(1, HELD // first.nbytes), *first.shape), first.dtype)
+        self._room[0], self._held = first, {0: 0}  # place in the room → number of the frame that is there
         self._lock = threading.Lock()
-        self.shape: tuple[int, ...] = self.frame(0).shape
         self.count = self.movie.count or sum(1 for _ in self.movie.frames())
 
     def frame(self, number: int) -> Frame:
         """One frame (H, W). Raises :class:`DataError`."""
         with self._lock:
-            if self._room is not None and number in self._held:
-                kept: Frame = self._room[self._held[number]].copy()
+            if self._held.get(number % len(self._room)) == number:
+                kept: Frame = self._room[number % len(self._room)].copy()
                 return kept
-            if number < self._next or self._next == 0:
+            if number < self._next:
                 self._frames, self._next = self.movie.frames(), 0
-            for frame in self._frames:
-                self._keep(self._next, frame)
-                self._next += 1
-                if self._next > number:
+            for at, frame in enumerate(self._frames, self._next):
+                self._next = at + 1
+                if frame.dtype == self._room.dtype:
+                    place = at % len(self._room)
+                    self._room[place], self._held[place] = frame, at
+                if at == number:
                     return frame
         raise DataError(f"{self.movie.path}: there is no frame {number}")
-
-    def _keep(self, number: int, frame: Frame) -> None:
-        if self._room is None:
-            self._room = np.empty((max(1, HELD // frame.nbytes), *frame.shape), frame.dtype)
-        if number not in self._held and frame.dtype == self._room.dtype:
-            full = len(self._held) == len(self._room)
-            place = self._held.popitem(last=False)[1] if full else len(self._held)
-            self._room[place], self._held[number] = frame, place
 
     def bmp(self, number: int) -> bytes:
         """One frame as BMP, which takes no time to compress; 16 bit are stretched over the range of the first frame."""
@@ -66,9 +59,6 @@ class Pictures:
 
         frame, out = self.frame(number), io.BytesIO()
         if frame.dtype != np.uint8:
-            if self._range is None:
-                first = self.frame(0)
-                self._range = float(first.min()), float(first.max())
             low, high = self._range
             frame = np.clip(255 * (frame - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
         Image.fromarray(frame).save(out, "bmp")

@@ -79,10 +79,8 @@ class Background:
         """The background as a frame shows it, where the camera drifts."""
         if self.drift is None:
             return self
-        down, across = shift_at(self.drift, number)
-        level, gain = (np.roll(part, (down, across), (0, 1)) for part in (self.level, self.gain))
-        gain[: max(down, 0)] = gain[:, : max(across, 0)] = np.nan
-        gain[len(gain) + min(down, 0) :] = gain[:, gain.shape[1] + min(across, 0) :] = np.nan
+        shift = shift_at(self.drift, number)
+        level, gain = (ndimage.shift(part, shift, order=0, cval=np.nan) for part in (self.level, self.gain))
         return replace(self, level=level, gain=gain)
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
@@ -113,9 +111,9 @@ class Background:
 
         What is darker than half the ``contrast`` of a bubble is another, or something else before the light.
         """
-        down, across = (TILE * np.arange(side) - at for side, at in zip(tiles.shape, (bubble.y, bubble.x), strict=True))
+        far = Circle(bubble.x / TILE, bubble.y / TILE, (1.4 * bubble.R + 8) / TILE).off(tiles.shape) > 0
         lit = ndimage.uniform_filter(tiles, 3, mode="nearest") > contrast / 2
-        outside = tiles[(np.add.outer(down**2, across**2) > (1.4 * bubble.R + 8) ** 2) & lit]
+        outside = tiles[far & lit]
         if len(outside) < 0.05 * tiles.size:
             return image
         change = np.float32(np.median(outside[:: -(-len(outside) // STEADY)]))
@@ -140,13 +138,10 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     nearest = tuple(ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True))
     drift = drift_of([frame[nearest] for frame in samples], numbers)  # what is burnt in does not drift
     if drift is not None:
-        unseen = np.any([np.roll(unseen, np.negative(shift_at(drift, n)), (0, 1)) for n in numbers], axis=0)
+        back = [np.negative(shift_at(drift, n)) for n in numbers]
+        unseen = np.any([ndimage.shift(unseen, shift, order=0, cval=1) for shift in back], axis=0)  # by some frames
         leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
-        samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
-        height, width = first.shape
-        (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
-        # at the border is what only some frames show
-        unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
+        samples = [np.roll(f, shift, (0, 1)) for f, shift in zip(samples, back, strict=True)]
     of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
     leading = leading[(flashed := flashes_first(leading, samples)) :]
     first = leading[0].astype(np.float32)
@@ -176,8 +171,7 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         patches, sizes = labelled(part)
         middles = ndimage.center_of_mass(part, patches, range(1, len(sizes)))
         at = " and ".join(f"{x:.0f},{y:.0f}" for y, x in middles)
-        words = f"{movie.path}: what {what} about {at} (x,y) in all frames is no bubble and is not looked at"
-        movie.notes.extend([words] * (at != "" and words not in movie.notes))
+        movie.note(f"what {what} about {at} (x,y) in all frames is no bubble and is not looked at", at != "")
     if empty > 2:
         noise = pixel_noise(np.array([f - level for f in leading[:empty]]), unit) * (empty / (empty - 1)) ** 0.5
     background = _with_sign(level, samples, noise, empty and flashed + empty, blind, unit)
@@ -249,8 +243,7 @@ def _changed(frame: Frame, other: Frame, noise: float, side: int = 5) -> Mask:
 def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     """Where something low changes all the time (H, W), brighter here and darker there at once: time stamps."""
     none = np.zeros(leading[0].shape, dtype=bool)
-    steps = len(leading) - 1
-    if steps < LEAST_PAIRS:
+    if len(leading) <= LEAST_PAIRS:
         return none
     frames = [frame.astype(np.float32) for frame in leading]
     changes = [_changed(b, a, noise, 3) for a, b in pairwise(frames)]
@@ -384,12 +377,11 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     """
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)
-    y, x = np.mgrid[: total.shape[0], : total.shape[1]]
     for _, image, places in _steadied(background, samples):
         near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
         quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
-            quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
+            quiet &= circle.off(quiet.shape) > 0.3 * circle.R + 10
         total[quiet] += (background.level + image / background.gain)[quiet]  # at the lamp's brightness of the level
         count[quiet] += 1
     level = total / count
@@ -424,29 +416,24 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             shown.append((image, outlines[0]))
-            clipped.append(float(np.mean(frame[outlines[0].circle.beside(frame.shape, AROUND)] > full)))
+            clipped.append(float(np.mean(frame[np.abs(outlines[0].circle.off(frame.shape)) < AROUND] > full)))
     if not shown:
         raise DataError(
             f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
     optics = _shared([o for _, o in shown], background.noise)
-    grey = float(np.nanmedian(np.abs(1 / background.gain)))
-    optics = with_hidden(optics, samples, float(np.median(clipped)), grey)
     clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
     values = np.array([o.rim for o in rims]).reshape(-1, 3)
     heights = values[:, 0] * DENSITY / np.hypot([o.width for o in rims], values[:, 2])
-    if not rims or np.median(heights) - _scatter(heights) < THRESHOLD:
-        return optics
-    rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
-    rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
-    return (
-        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden, hides=optics.hides)
-        if rimmed
-        else optics
-    )
+    if rims and np.median(heights) - _scatter(heights) >= THRESHOLD:
+        rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
+        if rimmed := _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles):
+            optics = replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std)
+    grey = float(np.nanmedian(np.abs(1 / background.gain)))
+    return with_hidden(optics, samples, float(np.median(clipped)), grey)
 
 
 def _again(shown: Sequence[tuple[Frame, Outline]], optics: Optics, circles: int) -> list[Outline]:

@@ -1,6 +1,6 @@
 """What may be the bubble in a frame: patches with the outline of a bubble, and what is doubtful in them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -87,9 +87,7 @@ def look_at(
 
 def _without(image: Array, other: Circle, optics: Optics) -> Array:
     """The image without another bubble and its blur."""
-    y, x = np.ogrid[: image.shape[0], : image.shape[1]]
-    near = np.hypot(x - other.x, y - other.y) < other.R + BLURS * optics.width
-    return np.where(near, np.float32(np.nan), image)
+    return np.where(other.off(image.shape) < BLURS * optics.width, np.float32(np.nan), image)
 
 
 def _same(a: Circle, b: Circle) -> bool:
@@ -121,8 +119,9 @@ def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:
 
 def _lit_outside(frame: Frame, image: Array, circle: Circle, noise: float) -> bool:
     """True if a part of what lies next to a dark bubble is saturated, and brighter than the background."""
-    about = replace(circle, R=circle.R + OUTSIDE / 2).beside(image.shape, OUTSIDE / 2)
-    return bool(np.mean(((frame > saturated([frame])) & (image > SURELY * noise))[about]) > GLARING)
+    off = circle.off(image.shape)
+    lit = (frame > saturated([frame])) & (image > SURELY * noise)
+    return bool(np.mean(lit[(off > 0) & (off < OUTSIDE)]) > GLARING)
 
 
 def _doubt(image: Array, outline: Outline, optics: Optics, circles: int) -> str:

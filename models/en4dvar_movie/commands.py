@@ -80,8 +80,8 @@ def track(
     part = watched(opened, choice["region"], choice["mask"])
     with counted("frames") as tell:
         progress = (lambda done: tell(done, opened.count)) if tell else (lambda done: None)
-        shutter = scale.exposure if scale.exposure > 0 else 0.0
-        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part, shutter)
+        cores = workers or available_cores()
+        track = track_movie(opened, cores, fixed, progress, scale.flashes, point, part, scale.exposure)
     for note in (*opened.notes, *track.notes):
         echo(f"note: {note}", err=True)
     words = command_line()
@@ -132,4 +132,4 @@ def _scaled(
         raise click.UsageError(f"--exposure {exposure} is longer than {between}")
     if instants[-1] - instants[0] >= 1 / movie.rate:
         raise click.UsageError(f"--flashes {flashes}: more than {between}")
-    return movie, Scale(movie.pixel, movie.rate, float("nan") if shutter is None else shutter, instants)
+    return movie, Scale(movie.pixel, movie.rate, shutter or 0.0, instants)

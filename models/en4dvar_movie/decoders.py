@@ -21,18 +21,12 @@ SQUARE = 0.001  # of a pixel's side: by which the other may differ
 MOST_COLOURS = 3  # of a frame
 CINE = "cine"  # the format of Phantom cameras
 WITHOUT_LOSS = "High 4:4:4 Predictive"  # the profile of H.264 that may have none
-PREFIXES = {
-    "m": 1e-3,
-    "milli": 1e-3,
-    **dict.fromkeys(("u", "µ", "μ", "\\u00B5", "micro"), 1e-6),
-    "n": 1e-9,
-    "nano": 1e-9,
-}
+PREFIXES = dict.fromkeys(("m", "milli"), 1e-3) | dict.fromkeys(("n", "nano"), 1e-9)
+PREFIXES |= dict.fromkeys(("u", "µ", "μ", "\\u00B5", "micro"), 1e-6)
 LENGTHS = {prefix + word: size for prefix, size in PREFIXES.items() for word in ("m", "meter", "metre")}
 LENGTHS |= {"micron": 1e-6, "microns": 1e-6, "cm": 1e-2}
-TIMES = {
-    prefix + word: size for prefix, size in {"": 1.0, **PREFIXES}.items() for word in ("s", "sec", "second", "seconds")
-}
+PREFIXES[""] = 1.0
+TIMES = {prefix + word: size for prefix, size in PREFIXES.items() for word in ("s", "sec", "second", "seconds")}
 
 
 def library(name: str) -> ModuleType:
@@ -190,7 +184,7 @@ def video_frames(path: Path) -> Iterator[Any]:
             if not 0 <= number < told - 1:
                 raise
         if number + 1 < told:
-            yield f"{path}: the file is cut off: it says that it holds {told} frames, {number + 1} are there"
+            yield f"the file is cut off: it says that it holds {told} frames, {number + 1} are there"
 
 
 def _count(file: Any, stream: Any) -> int:

@@ -187,10 +187,7 @@ def _descend(
     cost += 0.5 * float(precision @ (p - centre) ** 2)
     for _ in range(ROUNDS):
         H = A + np.diag(precision)
-        try:
-            step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g - precision * (p - centre))
-        except np.linalg.LinAlgError:
-            return None
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g - precision * (p - centre))
         trial = p + step
         trial[W] = np.clip(trial[W], 0.3, max(2 * p[W], 1.0))
         trial[GLARE] = np.clip(trial[GLARE], min(bright), max(bright))

@@ -144,14 +144,11 @@ def _lit(bubbles: Sequence[Chain], among: Iterable[int], looks: Sequence[Look]) 
         if np.sum(np.hypot(*(where - (x, y)).T) < TOUCH) <= BRIEF
     }
     for n in among:
-        bubble, born = bubbles[n], bubbles[n].candidates[0].frame
-        spots = [brief[frame] for frame in range(max(0, born - GAP), born + 2) if frame in brief]
-        if spots:
-            x, y, light = max(spots, key=lambda spot: spot[2])
-            circle = bubble.candidates[0].circle
-            off = np.hypot(circle.x - x, circle.y - y)
-            if off < circle.R + TOUCH:
-                choices.append((-light, -bubble.score, n))
+        first = bubbles[n].candidates[0]
+        spots = [spot for frame, spot in brief.items() if -GAP <= frame - first.frame <= 1]
+        x, y, light = max(spots, key=lambda spot: spot[2], default=(np.inf, np.inf, 0.0))
+        if np.hypot(first.circle.x - x, first.circle.y - y) < first.circle.R + TOUCH:
+            choices.append((-light, -bubbles[n].score, n))
     return min(choices)[2] if choices else None
 
 

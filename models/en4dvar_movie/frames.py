@@ -64,29 +64,23 @@ class Movie:
         noisy = False
         try:
             for number, read in enumerate(self.open()):
+                where = self._where(number)
                 if number == 0:
                     channel, coloured = _channel(read)
+                    first = _grey(read, channel, where)
+                    shape, even = first.shape, _evened(first)
                     name = ("red", "green", "blue")[channel]
-                    words = f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
-                    if coloured and words not in self.notes:
-                        self.notes.append(words)
-                where = self._where(number)
+                    self.note(f"frames are in colour; the channel with most light, {name}, is used", coloured)
+                    words = "pixels differ in a pattern of 2 × 2, as in raw frames of a colour camera"
+                    self.note(f"{words}: their brightness is made even", even is not None)
                 frame = _grey(read, channel, where)
-                if not shape:
-                    shape, even = frame.shape, _evened(frame)
-                    words = (
-                        f"{self.path}: pixels differ in a pattern of 2 × 2, as in raw frames of a colour camera: their "
-                        "brightness is made even"
-                    )
-                    self.notes.extend([words] * (even is not None and words not in self.notes))
                 if frame.shape != shape:
                     raise DataError(f"{where} is {_size(frame.shape)}, the first {_size(shape)}")
                 if even is not None:
-                    whole = frame.dtype.kind in "ui"
                     light = frame * even
-                    frame = (np.minimum(light.round(), np.iinfo(frame.dtype).max) if whole else light).astype(
-                        frame.dtype
-                    )
+                    if frame.dtype.kind in "ui":
+                        light = np.minimum(light.round(), np.iinfo(frame.dtype).max)
+                    frame = light.astype(frame.dtype)
                 differs = 0.0 if before is None else float(np.mean(frame != before))
                 if differs:
                     noisy = differs > 0.5  # in what stands still, too
@@ -101,6 +95,11 @@ class Movie:
             raise DataError(f"{self._where(number + 1)} cannot be read: {words}") from None
         if number < 0:
             raise DataError(f"{self.path}: the movie holds no frame")
+
+    def note(self, words: str, holds: bool = True) -> None:
+        """Keep, once, what a user should know of the movie where it ``holds``."""
+        if holds and (told := f"{self.path}: {words}") not in self.notes:
+            self.notes.append(told)
 
     def _where(self, number: int) -> str:
         return f"{self.path}: frame {number}{''.join(f' ({name})' for name in self.within)}"
@@ -242,25 +241,23 @@ def _folder(path: Path) -> Movie:
 
 
 def _video(path: Path) -> Movie:
-    notes: list[str] = []
-    damaged: set[int] = set()
-
     def read() -> Iterator[Frame]:
         for value in decoded(video_frames, path, allowed=MOVIES):
             if isinstance(value, str):
-                notes.extend([value] * (value not in notes))
+                movie.note(value)
             elif isinstance(value, int):
-                damaged.add(value)
+                movie.damaged.add(value)
             else:
                 yield value
 
     count, codec, rate = decoded_whole(video_about, path, allowed=MOVIES, kind="a movie")
-    if codec:
-        notes.append(
-            f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "
-            "several times too small where few bits are left; take the frames that the camera saved, if there are any"
-        )
-    return Movie(path, read, count, rate=rate, notes=notes, damaged=damaged)
+    movie = Movie(path, read, count, rate=rate)
+    movie.note(
+        f"compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be several "
+        "times too small where few bits are left; take the frames that the camera saved, if there are any",
+        bool(codec),
+    )
+    return movie
 
 
 def _raw(path: Path, raw: str) -> Movie:

@@ -24,10 +24,10 @@ class Circle:
     y: float
     R: float
 
-    def beside(self, shape: tuple[int, ...], far: float) -> Mask:
-        """What of an image (H, W) lies no further than so many pixels from the circle."""
-        y, x = np.ogrid[: shape[0], : shape[1]]
-        return np.asarray(np.abs(np.hypot(x - self.x, y - self.y) - self.R) < far)
+    def off(self, shape: tuple[int, ...]) -> Array:
+        """How far the pixels of an image (H, W) lie outside the circle, negative inside."""
+        squares = np.add.outer((np.arange(shape[0]) - self.y) ** 2, (np.arange(shape[1]) - self.x) ** 2)
+        return np.asarray(np.sqrt(squares) - self.R)
 
 
 @dataclass(frozen=True)

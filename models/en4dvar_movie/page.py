@@ -2,7 +2,8 @@
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
         command=command,
         count=len(track.readings),
         used=len(used),
-        what="frames" if len(track.flashes) == 1 else "circles",
+        what="frames" if len(scale.flashes) == 1 else "circles",
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
         background=track.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
@@ -71,72 +72,45 @@ def _shape(used: list[Reading], scale: Scale) -> Chart:
 
 
 def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
-    """Evenly chosen frames as pictures, each with its outline as a path over it."""
-    circles = by_frame(track.readings)
-    every = -(-len(circles) // SHOWN)
-    full = brightest(track)
-    return [
-        _picture(number, frame, circles[number], full)
-        for number, frame in enumerate(movie.frames())
-        if number % every == 0 and number in circles
-    ]
-
-
-def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
-    step = -(-max(frame.shape) // SIDE)
-    small = grey(frame[::step, ::step], full)
-    shown = [(r.outline, r.doubt) for r in readings if r.used or r.doubt]
-    outlines = [(outline.points(TURN) / step, doubt) for outline, doubt in shown if outline is not None]
-    return {
-        "frame": str(number),
-        "png": png(small),
-        "width": str(small.shape[1]),
-        "height": str(small.shape[0]),
-        "outlines": [
-            (" ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points), "doubtful" if doubt else "")
-            for points, doubt in outlines
-        ],
-        "words": "; ".join(dict.fromkeys(r.reason for r in readings if r.reason)),
-    }
-
-
-def png(picture: Frame) -> str:
+    """Evenly chosen frames as pictures, each with its outlines as paths over it."""
     from PIL import Image
 
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG", optimize=False)
-    return base64.b64encode(buffer.getvalue()).decode()
+    pictures = []
+    for number, picture, readings in _frames(movie, track, -(-(track.readings[-1].frame + 1) // SHOWN)):
+        step = -(-max(picture.shape) // SIDE)
+        small, png = picture[::step, ::step], io.BytesIO()
+        Image.fromarray(small).save(png, format="PNG")
+        outlines = [
+            (" ".join(f"{x:.2f},{y:.2f}" for x, y in r.outline.points(TURN) / step + 0.5), r.doubt)
+            for r in readings
+            if r.outline is not None and (r.used or r.doubt)
+        ]
+        words = "; ".join(dict.fromkeys(r.reason for r in readings if r.reason))
+        shown = {"frame": number, "png": base64.b64encode(png.getvalue()).decode(), "outlines": outlines}
+        pictures.append({**shown, "height": len(small), "width": small.shape[1], "words": words})
+    return pictures
 
 
-def by_frame(readings: Sequence[Reading]) -> dict[int, list[Reading]]:
-    """Frame → its readings, one a circle."""
-    of_frames: dict[int, list[Reading]] = {}
-    for reading in readings:
-        of_frames.setdefault(reading.frame, []).append(reading)
-    return of_frames
+def _frames(movie: Movie, track: Track, every: int = 1) -> Iterator[tuple[int, Frame, list[Reading]]]:
+    """Number of every n-th frame, its picture (H, W) in grey, and its readings, one a circle."""
+    full = max(1.3 * float(np.percentile(track.background.level, 95)), 1.0)
+    of_frames = groupby(track.readings, key=lambda reading: reading.frame)
+    for frame, (number, readings) in zip(movie.frames(), of_frames, strict=False):
+        if number % every == 0:
+            yield number, np.clip(255.0 * frame / full, 0, 255).astype(np.uint8), list(readings)
 
 
 def outlined(movie: Movie, track: Track) -> Iterator[Frame]:
     """Coloured pictures (H, W, 3) of 8 bit, of even sides as videos need."""
-    readings = by_frame(track.readings)
-    full = brightest(track)
-    for number, frame in enumerate(movie.frames()):
-        scale = -(-WIDE // max(frame.shape))
-        large = np.kron(grey(frame, full), np.ones((scale, scale), np.uint8))
+    for _, small, readings in _frames(movie, track):
+        scale = -(-WIDE // max(small.shape))
+        large = np.kron(small, np.ones((scale, scale), np.uint8))
         picture = np.repeat(np.pad(large, [(0, side % 2) for side in large.shape])[..., None], 3, axis=2)
-        for reading in readings.get(number, ()):
+        for reading in readings:
             if reading.used and reading.outline is not None:
                 around = np.linspace(0, 2 * np.pi, int(8 * reading.radius * scale) + 16)
                 _draw(picture, (reading.outline.points(around) + 0.5) * scale)
         yield picture
-
-
-def brightest(track: Track) -> float:
-    return max(1.3 * float(np.percentile(track.background.level, 95)), 1.0)
-
-
-def grey(frame: Frame, full: float) -> Frame:
-    return np.clip(255.0 * frame / full, 0, 255).astype(np.uint8)
 
 
 def _draw(picture: Frame, points: Array) -> None:

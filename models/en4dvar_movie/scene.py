@@ -116,10 +116,9 @@ def _darken(frame: Array, radii: Array, moved: Array, M: Array, scene: Scene) ->
     shade = _cover(r / form, radii) - (GLARE * _cover(r / form, scene.centre * radii) if scene.centre else 0.0)
     smooth = ndimage.gaussian_filter(shade, scene.blur * FINE, mode="nearest", truncate=TRUNCATE)
     whole = smooth.reshape(bottom - top, FINE, right - left, FINE).mean(axis=(1, 3))
-    inside = np.s_[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
-    rows, columns = frame[inside].shape
-    first = max(-top, 0), max(-left, 0)
-    frame[inside] *= 1 - scene.contrast * whole[first[0] : first[0] + rows, first[1] : first[1] + columns]
+    about = np.pad(frame, margin)
+    about[top + margin : bottom + margin, left + margin : right + margin] *= 1 - scene.contrast * whole
+    frame[:] = about[margin:-margin, margin:-margin]
 
 
 def _cover(r: Array, radii: Array) -> Array:

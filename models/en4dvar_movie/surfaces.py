@@ -158,7 +158,6 @@ def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
     """
     smooth = np.abs(ndimage.uniform_filter(differences, (0, MEAN, MEAN)))
     most = float(np.max(np.percentile(smooth[:, field], 99, axis=1)))
-    y, x = np.ogrid[: field.shape[0], : field.shape[1]]
     both = either = 0
     for differs in (smooth > DIFFERS * most) & field:
         labels, sizes = labelled(ndimage.binary_fill_holes(differs))  # bright centres are holes
@@ -169,7 +168,7 @@ def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
             circle = circle_through(points[np.all([field[v, u] for u, v in sides], axis=0)])
             if circle is None:
                 continue
-            disc = field & ((x - circle.x) ** 2 + (y - circle.y) ** 2 < circle.R**2)
+            disc = field & (circle.off(field.shape) < 0)
             both, either = both + np.sum(patch & disc), either + np.sum(patch | disc)
     of_all = len(differences) * np.sum(field)
     return both / of_all, (either - both) / of_all
@@ -180,6 +179,5 @@ def is_round(patch: Mask, share: float = ROUND) -> bool:
     circle = circle_through(rim(patch))
     if circle is None:
         return False
-    j, i = np.indices(patch.shape)
-    disc = (i - circle.x) ** 2 + (j - circle.y) ** 2 < circle.R**2
+    disc = circle.off(patch.shape) < 0
     return bool(np.sum(patch & disc) > share * np.sum(patch | disc))

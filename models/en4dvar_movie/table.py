@@ -25,11 +25,11 @@ UNKNOWN = 0.01  # of the step between frames, where no exposure is given
 
 @dataclass(frozen=True)
 class Scale:
-    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where not known), ``flashes`` of a frame after its instant, s."""
+    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (0 where not known), ``flashes`` of a frame after its instant, s."""
 
     pixel: float
     rate: float
-    exposure: float = float("nan")
+    exposure: float = 0.0
     flashes: tuple[float, ...] = (0.0,)
 
     def time(self, reading: Reading) -> float:

@@ -44,7 +44,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Track:
-    """The readings of a movie, in the order of time, and what its frames share; ``flashes`` (S,) of a frame, s.
+    """The readings of a movie, in the order of time, and what its frames share.
 
     ``others`` are the readings of further bubbles, ``notes`` what a user should know of the choice between them.
     """
@@ -52,7 +52,6 @@ class Track:
     readings: tuple[Reading, ...]
     background: Background
     optics: Optics
-    flashes: tuple[float, ...] = (0.0,)
     others: tuple[tuple[Reading, ...], ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -135,7 +134,7 @@ def track(
             f"the radius is the same in all frames, {np.mean(radii):.2f} pixels: if that is the edge of an aperture or "
             "of something else that stands still, leave it out with --mask"
         )
-    return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
+    return Track(read[0], background, optics, tuple(read[1:]), tuple(notes))
 
 
 def _readings(

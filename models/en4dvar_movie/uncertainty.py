@@ -109,14 +109,12 @@ def _unseen(known: Sequence[Outline], lasting: float) -> Array:
     of an oval that fits better by more than noise, and what a ``lasting`` mode 2 over R makes of it, as noise allows.
     """
     where, variance = [k for k, o in enumerate(known) if o.seen < 1], np.zeros(len(known))
-    cut = [known[k] for k in where]
-    ovals = [o.oval for o in cut]
-    off = np.array([(v.circle.R if v else o.circle.R) - o.circle.R for o, v in zip(cut, ovals, strict=True)])
-    noise = np.array([v.variance * v.ratio if v else o.circle.R**2 for o, v in zip(cut, ovals, strict=True)])
-    better = np.array([o.better / v.ratio if v else 0.0 for o, v in zip(cut, ovals, strict=True)])
-    elongated = np.array([(CUT * lasting * o.circle.R * (1 - o.seen)) ** 2 for o in cut])
-    told = _beyond(better, np.ones(len(cut))) > 0
-    variance[where] = np.where(told, off**2 + noise, np.minimum(elongated, noise))
+    cut = [(o, o.circle.R, o.oval) for o in known if o.seen < 1]
+    told = [(v.circle.R - R, v.variance * v.ratio, o.better / v.ratio) if v else (0.0, R**2, 0.0) for o, R, v in cut]
+    off, noise, better = np.reshape(told, (-1, 3)).T
+    elongated = np.array([(CUT * lasting * R * (1 - o.seen)) ** 2 for o, R, _ in cut])
+    oval = _beyond(better, np.ones(len(cut))) > 0
+    variance[where] = np.where(oval, off**2 + noise, np.minimum(elongated, noise))
     return variance
 
 
