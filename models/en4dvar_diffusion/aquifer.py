@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict
 from pydantic import Field as Setting
 from scipy.sparse import csc_matrix, diags, identity
 from scipy.sparse.linalg import splu
@@ -26,7 +25,6 @@ SOURCE = "Bear (1979), Hydraulics of Groundwater, § 5-1"
 class AquiferSettings(Described):
     """The grid, and the steps in time."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     shape: tuple[Side, Side] = (100, 100)
     """Rows and columns of cells, each of side 1."""
     step: Annotated[float, Setting(gt=0)] = 2.0
