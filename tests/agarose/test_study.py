@@ -22,8 +22,17 @@ from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar_agarose import report, tables
 from en4dvar_agarose.commands import study as study_command
-from en4dvar_agarose.figures import all_figures, collapse, combined, iterations, population
-from en4dvar_agarose.fits import Fit, OneGel, Study, probability, verdict
+from en4dvar_agarose.figures import (
+    all_figures,
+    collapse,
+    combined,
+    distributions,
+    evidence,
+    iterations,
+    nrmse_figure,
+    population,
+)
+from en4dvar_agarose.fits import Comparison, Fit, OneGel, Study, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
@@ -281,6 +290,18 @@ def test_a_parameter_that_is_held_fixed_has_no_panel_and_no_interval():
     (panel,) = (p for row in combined(told, fit).rows for p in row.panels if p.xlabel.startswith(r"$\mu$"))
     members, before = (mark.y.max() for mark in panel.marks[1:3])
     assert before == pytest.approx(members / 5, rel=0.3)  # densities of the same numbers, five times as wide
+
+
+def test_figures_of_more_gels_than_colours_show_every_one():
+    """The fifth was left out of the distributions, and an IndexError ended the study at its end."""
+    problem = SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={})
+    sweep = SimpleNamespace(parameters=(G,), theta=np.array([[1.0], [2.0], [3.0]]), nrmse=np.array([0.95, 0.96, 0.97]))
+    gels = [f"{n} %" for n in range(5)]
+    fits = {gel: {"qlkv": Fit(gel, "qlkv", (problem,) * 3, sweep, ())} for gel in gels}
+    comparisons = {gel: Comparison(np.array([1.0, 99.0]), 0.0, 0.0, (1.0, 1.0), ()) for gel in gels}
+    told = Study(None, fits, {}, comparisons, {})
+    charts = distributions(told, "sweep"), nrmse_figure(told, "sweep"), evidence(told)
+    assert [len(chart.rows[0].panels[0].marks) for chart in charts] == [10, 10, 2 + 10]
 
 
 def test_collapse_of_a_known_history():
