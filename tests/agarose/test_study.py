@@ -304,6 +304,20 @@ def test_figures_of_more_gels_than_colours_show_every_one():
     assert [len(chart.rows[0].panels[0].marks) for chart in charts] == [10, 10, 2 + 10]
 
 
+def test_the_apparent_modulus_is_that_of_the_sets_whose_truth_is_known():
+    """With a truth of fewer data sets a ValueError of numpy ended the study at its end."""
+    rng, names = np.random.default_rng(2), ["a", "b", "c", "d", "e"]
+    problems = tuple(
+        SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={}, observations=SimpleNamespace(name=n))
+        for n in names
+    )
+    truth = {name: {"G": rng.uniform(1, 2), "alpha": 1.0, "R0": 1.0} for name in names[1:]}
+    analyses = tuple(SimpleNamespace(posterior=np.full((3, 1), truth.get(name, {"G": 9.0})["G"])) for name in names)
+    told = Study(None, {"1 %": {"nh": Fit("1 %", "nh", problems, None, analyses)}}, {}, {}, truth)
+    correlation, _ = report._apparent_modulus(told, "1 %")
+    assert correlation == pytest.approx(1.0)
+
+
 def test_collapse_of_a_known_history():
     times = np.arange(0.0, 20.0, 1.0)
     radius = 100 - (times - 9.3) ** 2
