@@ -125,16 +125,12 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
     model = next(iter(problems.values()))[0].model
     with choose_executor(model, workers=workers) as executor:
         work = _Parts(plan, executor, say or (lambda message: None), keep, {})
-        with work.timed("sweep"):
-            sweeps = work.sweeps(problems)
-        with work.timed("en4dvar"):
-            fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
-            for (gel, m), sets in problems.items():
-                fits[gel][m] = work.en4dvar(Fit(gel, m, sets, sweeps[gel, m], ()))
-            narrow = {gel: fit for gel, models in fits.items() if (fit := work.narrow(models.get("qlkv")))}
-        with work.timed("population"):
-            populations, comparisons = work.pooled(fits)
-    work.say(f"population and model comparison in {work.seconds['population']:.1f} s")
+        sweeps = work.sweeps(problems)
+        fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
+        for (gel, m), sets in problems.items():
+            fits[gel][m] = work.analysed(Fit(gel, m, sets, sweeps[gel, m], ()))
+        narrow = {gel: fit for gel, models in fits.items() if (fit := work.narrow(models.get("qlkv")))}
+        populations, comparisons = work.pooled(fits)
     truth = read_truth(plan.truth) if plan.truth else {}
     return Study(plan, fits, populations, comparisons, truth, work.seconds, narrow)
 
@@ -147,11 +143,11 @@ class _Parts:
     keep: StudyCheckpoints | None
     seconds: dict[str, float]
 
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[part] = time.perf_counter() - start
+    def tell(self, words: str, part: str, began: float) -> None:
+        """Say what is done, and add the time that it took to that of its part of the study."""
+        spent = time.perf_counter() - began
+        self.seconds[part] = self.seconds.get(part, 0.0) + spent
+        self.say(f"{words} in {spent:.1f} s")
 
     def kept(self, kind: type[D], compute: Callable[[], D], fit: Fit) -> D:
         """The result of ``compute``, of now or of before the study was interrupted."""
@@ -175,27 +171,19 @@ class _Parts:
             for key in keys:
                 sweeps[key] = result.part(slice(first, first + len(problems[key])))
                 first += len(problems[key])
-            words = " and ".join(f"{gel} {model}" for gel, model in keys)
-            spent = time.perf_counter() - began
-            self.say(
-                f"{words}: sweep of {result.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s"
-            )
+            words = f"sweep of {result.trajectories} trajectories against {len(every)} data sets"
+            self.tell(f"{' and '.join(map(' '.join, keys))}: {words}", "sweep", began)
         return sweeps
 
-    def en4dvar(self, fit: Fit) -> Fit:
-        """With the analyses of its problems."""
-        began = time.perf_counter()
-        analyses = self._analysed(fit)
-        spent = time.perf_counter() - began
-        self.say(f"{fit.gel} {fit.model}: En4D-Var of {len(fit.problems)} data sets in {spent:.1f} s")
-        return analyses
-
-    def _analysed(self, fit: Fit) -> Fit:
-        config = self.plan.configs[fit.gel][fit.model]
+    def analysed(self, fit: Fit, prior: str = "") -> Fit:
+        """With the analyses of its problems; ``prior`` says in what it is not that of the configuration."""
+        config, began = self.plan.configs[fit.gel][fit.model], time.perf_counter()
         seeds = (own_seed(config.seed, name) for name in fit.names)
         analyses = tuple(
             assimilate(p, config.assimilation, seed, self.executor) for p, seed in zip(fit.problems, seeds, strict=True)
         )
+        words = f"{fit.gel} {fit.model}{prior}: En4D-Var of {len(fit.problems)} data sets"
+        self.tell(words, "en4dvar", began)
         return replace(fit, analyses=analyses)
 
     def narrow(self, fit: Fit | None) -> Fit | None:
@@ -205,11 +193,12 @@ class _Parts:
             return None
         relative = printed[1] / printed[0]
         terms = tuple(replace(t, std=relative) if t.parameter.name == "R0" else t for t in fit.prior.terms)
-        return self._analysed(replace(fit, problems=tuple(replace(p, prior=Prior(terms)) for p in fit.problems)))
+        narrow = replace(fit, problems=tuple(replace(p, prior=Prior(terms)) for p in fit.problems))
+        return self.analysed(narrow, ", R0 as narrow as printed")
 
     def pooled(self, fits: Mapping[str, dict[Model, Fit]]) -> tuple[dict[str, Population], dict[str, Comparison]]:
         """Populations of the general law and comparisons with the neo-Hookean, a gel each; ``fits`` get evidences."""
-        populations, comparisons = {}, {}
+        populations, comparisons, began = {}, {}, time.perf_counter()
         for gel, models in fits.items():
             for m, fit in models.items():
                 models[m] = replace(fit, sampled=self._sampled(fit))
@@ -218,6 +207,7 @@ class _Parts:
                 populations[gel] = general
             if len(estimates) == len(COMPARED):
                 comparisons[gel] = self._comparison(models, estimates)
+        self.tell("population and model comparison", "population", began)
         return populations, comparisons
 
     def _sampled(self, fit: Fit) -> tuple[OwnDraws, ...]:
