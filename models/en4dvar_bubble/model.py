@@ -36,7 +36,6 @@ from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.laws import REGISTRY, get_law
 from en4dvar_bubble.laws.parameters import ALPHA
 from en4dvar_bubble.laws.tabulate import GRID, ends
-from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
 from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings
@@ -277,7 +276,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     else:
         words = "the gas were polytropic (gas: polytropic)"
         of_vapour = model.vapour, NOTHING, medium
-        vapour, said, its = ("none", SATURATED, _saturated(medium)) if model.vapour == "transport" else of_vapour
+        vapour, said, its = ("none", SATURATED, medium.saturated) if model.vapour == "transport" else of_vapour
         yield changed("gas_model", words, said, gas="polytropic", medium_heat="cold", vapour=vapour, medium=its)
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
@@ -285,10 +284,6 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
     yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
     yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")
-
-
-def _saturated(medium: Medium) -> Medium:
-    return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
 
 
 def _of_vapour(model: Dynamics, changed: Callable[..., Alternative]) -> Iterator[Alternative]:
@@ -304,4 +299,4 @@ def _of_vapour(model: Dynamics, changed: Callable[..., Alternative]) -> Iterator
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
     elif "p_v" not in model.named:
         words = "vapour filled the bubble (vapour_pressure: saturated)"
-        yield changed("vapour", words, SATURATED, medium=_saturated(medium))
+        yield changed("vapour", words, SATURATED, medium=medium.saturated)

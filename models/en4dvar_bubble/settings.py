@@ -39,7 +39,6 @@ from en4dvar_bubble.medium import (
     KnownMedium,
     Medium,
     known_medium,
-    saturated_vapour_pressure,
 )
 from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
@@ -366,9 +365,8 @@ class BubbleSettings(Described):
     def liquid(self) -> Medium:
         """All constants, with the vapour pressure."""
         medium = self.constants.medium
-        if self.vapour_pressure == "saturated":
-            return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
-        return replace(medium, p_v=float(self.vapour_pressure))
+        saturated = self.vapour_pressure == "saturated"
+        return medium.saturated if saturated else replace(medium, p_v=float(self.vapour_pressure))
 
     @property
     def solver_accuracy(self) -> Accuracy:
