@@ -115,7 +115,7 @@ POPULATION = ("G", "alpha", "mu", "R0")
 COMPARED: tuple[Model, Model] = ("nh", "qlkv")
 
 
-def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
+def run_study(plan: StudyPlan, workers: int, say: Say, keep: StudyCheckpoints) -> Study:
     """Compute everything; the truth of a twin is read last and enters no estimate.
 
     ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues. Raises
@@ -124,7 +124,7 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model
     with choose_executor(model, workers=workers) as executor:
-        work = _Parts(plan, executor, say or (lambda message: None), keep, {})
+        work = _Parts(plan, executor, say, keep, {})
         sweeps = work.sweeps(problems)
         fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
         for (gel, m), sets in problems.items():
@@ -140,7 +140,7 @@ class _Parts:
     plan: StudyPlan
     executor: Executor
     say: Say
-    keep: StudyCheckpoints | None
+    keep: StudyCheckpoints
     seconds: dict[str, float]
 
     def tell(self, words: str, part: str, began: float) -> None:
@@ -148,10 +148,6 @@ class _Parts:
         spent = time.perf_counter() - began
         self.seconds[part] = self.seconds.get(part, 0.0) + spent
         self.say(f"{words} in {spent:.1f} s")
-
-    def kept(self, kind: type[D], compute: Callable[[], D], fit: Fit) -> D:
-        """The result of ``compute``, of now or of before the study was interrupted."""
-        return self.keep.of(kind, compute, fit.gel, fit.model) if self.keep else compute()
 
     def sweeps(
         self, problems: Mapping[tuple[str, Model], Sequence[InverseProblem]]
@@ -163,10 +159,8 @@ class _Parts:
         sweeps = {}
         for keys in groups.values():
             every, began = one_model([p for key in keys for p in problems[key]]), time.perf_counter()
-            folder = self.keep.sweep(*keys[0]) if self.keep else None
-            result = run_sweep(
-                every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest_reading(every[0].model)
-            )
+            folder, earliest = self.keep.sweep(*keys[0]), earliest_reading(every[0].model)
+            result = run_sweep(every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest)
             first = 0
             for key in keys:
                 sweeps[key] = result.part(slice(first, first + len(problems[key])))
@@ -216,7 +210,7 @@ class _Parts:
             with one_blas_thread(), retold(ValueError, TooFewMembersError, "no evidence: "):
                 return OneByOne(tuple(own_draws(p, start, self.plan.seed, self.executor) for p, start in each))
 
-        return self.kept(OneByOne, compute, fit).sampled
+        return self.keep.of(OneByOne, compute, fit.gel, fit.model).sampled
 
     def _population(self, fit: Fit) -> Population | None:
         """None with fewer than 3 data sets."""
@@ -232,7 +226,9 @@ class _Parts:
         pooled = {
             m: math.nan if population is None else population.log_evidence for m, population in populations.items()
         }
-        one_nh, one_general = (self.kept(OneGel, partial(self._one_gel, fit), fit) for fit in (nh, general))
+        one_nh, one_general = (
+            self.keep.of(OneGel, partial(self._one_gel, fit), fit.gel, fit.model) for fit in (nh, general)
+        )
         return Comparison(
             single=general.log_evidence - nh.log_evidence,
             population=pooled["qlkv"] - pooled["nh"],

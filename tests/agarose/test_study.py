@@ -34,7 +34,7 @@ from en4dvar_agarose.figures import (
 )
 from en4dvar_agarose.fits import Comparison, Fit, OneGel, Study, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
-from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
+from en4dvar_agarose.run import COMPARED, StudyCheckpoints, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 from en4dvar_bubble.dynamics import R0
 from en4dvar_bubble.laws.parameters import MU, G
@@ -341,13 +341,18 @@ def twin(tmp_path_factory):
     """Every other data set of the twin; nobody here asks for populations, what all bubbles of a gel share, and the
     evidence of the law that is not compared.
     """
-    file = write_study(tmp_path_factory.mktemp("twin"), "*[02468]")
-    with pytest.MonkeyPatch.context() as patch:
+    folder = tmp_path_factory.mktemp("twin")
+    plan = load_study(write_study(folder, "*[02468]"), {"sweep.trajectories": 8192})
+    who = identity_of(plan.seed, plan.sweep, plan.named)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        StudyCheckpoints.open(folder / "out", force=False, resume=False, who=who, files=report.FILES) as keep,
+    ):
         sampled = _Parts._sampled
         patch.setattr(_Parts, "_sampled", lambda parts, fit: sampled(parts, fit) if fit.model in COMPARED else ())
         patch.setattr(_Parts, "_population", lambda *_: None)
         patch.setattr(_Parts, "_one_gel", lambda *_: OneGel(np.nan, np.nan))
-        return run_study(load_study(file, {"sweep.trajectories": 8192}), workers=2)
+        return run_study(plan, 2, print, keep)
 
 
 @pytest.mark.slow
