@@ -39,27 +39,23 @@ CHOSEN, ONE_SIDED = 1.3, 2.5  # errors of a window that the readings chose thems
 
 @dataclass(frozen=True)
 class Top:
-    """``time`` (s) and ``height`` (m) of the maximum, and their standard errors.
-
-    ``reading`` is the number of the largest reading, bad ones left out.
-    """
+    """``time`` (s) and ``height`` (m) of the maximum, and their standard errors."""
 
     time: float
     height: float
     time_std: float
     height_std: float
-    reading: int
 
 
 def top(times: Array, radius: Array, scatter: float) -> Top:
     """Of a history ``times`` (K,) s, ``radius`` (K,) m without bad readings, whose errors have the std ``scatter``."""
-    reading, late, estimates = int(np.argmax(radius)), math.nan, list[tuple[Array, Array]]()
+    late, estimates = math.nan, list[tuple[Array, Array]]()
     with suppress(DataError):
         excursion = lobe(times, radius)
         late, estimates = LATE * excursion.t_c, list(_estimates(times, radius, scatter, excursion))
     if not estimates:  # a few readings between which anything may lie, or a history that begins behind the top
-        height, time_std = float(radius[reading]), float(np.fmax(np.median(np.diff(times)), late))
-        return Top(float(times[reading]), height, time_std, 0.03 * height, reading)
+        height, time_std = float(radius.max()), float(np.fmax(np.median(np.diff(times)), late))
+        return Top(float(times[np.argmax(radius)]), height, time_std, 0.03 * height)
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     chosen = estimates[0]
     for value, std in estimates:
@@ -71,7 +67,7 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
     value, std = chosen
     wider = CHOSEN if np.sum(times < value[0]) > 1 else ONE_SIDED
     time_std, height_std = wider * std
-    return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std), reading)
+    return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std))
 
 
 def _estimates(times: Array, radius: Array, scatter: float, excursion: Lobe) -> Iterator[tuple[Array, Array]]:
@@ -234,7 +230,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     seen, lost = _before_a_hole(times, radius)
     peak = _lobe(times[:seen], radius[:seen], start != "laser" and np.isfinite(rests[0]))
     highest = top(times[:seen], radius[:seen], scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
-    largest = highest.reading
+    largest = int(np.argmax(radius[:seen]))
     prominence, n_minima = _minima(with_unseen(times[largest:], radius[largest:])[1], scatter)
     rebound = second_maximum(radius)
     begins = _begins(radius, largest)
