@@ -81,11 +81,8 @@ class Aquifer(ForwardModel):
     def _heads(self, state: Array, durations: Sequence[float] | Array) -> list[Array]:
         """Heads (n,) after each of the durations, one after the other."""
         head, (recharge, storage) = state[: self.size].copy(), state[-2:]
-        flow, solvers, heads = (
-            self.conductances(state[self.layout["ln_T"]]),
-            dict[float, Callable[[Array], Array]](),
-            [],
-        )
+        flow, heads = self.conductances(state[self.layout["ln_T"]]), list[Array]()
+        solvers: dict[float, Callable[[Array], Array]] = {}
         for duration in durations:
             steps = math.ceil(duration / self.longest - 1e-9)
             rate = float(f"{storage * steps / duration:.12g}") if steps else 0.0  # of times as they are rounded, one
