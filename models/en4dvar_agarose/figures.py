@@ -142,7 +142,7 @@ def distributions(study: Study, route: Route) -> Chart:
 def _density(panel: Panel, values: Array, colour: str, dash: str, label: str) -> None:
     """Smoothed density in ln θ, on a logarithmic axis; its area in ln θ is one."""
     logs = np.log(values)
-    width = max(1.06 * logs.std(ddof=1) * len(logs) ** -0.2, 0.02)
+    width = max(1.06 * logs.std(ddof=min(1, len(logs) - 1)) * len(logs) ** -0.2, 0.02)
     grid = np.linspace(logs.min() - 3 * width, logs.max() + 3 * width, 300)
     z = (grid[:, None] - logs) / width
     density = np.exp(-0.5 * z * z).sum(axis=1) / (len(logs) * width * np.sqrt(2 * np.pi))

@@ -304,6 +304,16 @@ def test_figures_of_more_gels_than_colours_show_every_one():
     assert [len(chart.rows[0].panels[0].marks) for chart in charts] == [10, 10, 2 + 10]
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_distribution_of_one_data_set_is_a_peak():
+    """It was a line of NaN, and numpy's RuntimeWarning was printed."""
+    problem = SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={})
+    sweep = SimpleNamespace(parameters=(G,), theta=np.array([[1e3]]), nrmse=np.array([0.95]))
+    told = Study(None, {"1 %": {"qlkv": Fit("1 %", "qlkv", (problem,), sweep, ())}}, {}, {}, {})
+    line, _ = distributions(told, "sweep").rows[0].panels[0].marks
+    assert line.x[np.argmax(line.y)] == pytest.approx(1.0, rel=0.01)  # kPa
+
+
 def test_the_apparent_modulus_is_that_of_the_sets_whose_truth_is_known():
     """With a truth of fewer data sets a ValueError of numpy ended the study at its end."""
     rng, names = np.random.default_rng(2), ["a", "b", "c", "d", "e"]
