@@ -193,7 +193,7 @@ def refuse_to_replace(force: bool, *outs: Path | None, read: Sequence[str | Path
         if there and os.path.realpath(out) in sources:
             raise OutputError(f"{out}: is what the command reads, and is not replaced; give another name")
         if out.exists() and not force:
-            raise OutputError(f"{out}: exists; give --force to replace it")
+            raise OutputError(f"{out}: exists; give --force to replace it, or another name")
         if (place := os.path.realpath(out)) in places:
             raise OutputError(f"{out}: is to hold two things; give one of them another name")
         places.add(place)

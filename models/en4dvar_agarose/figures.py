@@ -1,13 +1,14 @@
 """The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.fits.Study`."""
 
 from collections.abc import Iterable, Iterator
+from itertools import cycle
 
 import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
-from en4dvar_agarose.fits import LEVELS, Fit, Study
+from en4dvar_agarose.fits import DECISIVE, LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_agarose.settings import named
 from en4dvar_bubble.model import BubbleModel
@@ -69,11 +70,11 @@ def collapse(times: Array, radius: Array) -> tuple[float, float, float]:
 def scaled_data(study: Study) -> Chart:
     """R/R_max against t/t_c, t from the start of the scaled history; open and filled markers for the gels."""
     panel = Panel(r"$(t - t_{\max})/t_c + 1$", r"$R/R_{\max}$", ylim=(0.0, 1.1), legend=True)
-    for number, gel in enumerate(study.fits):
+    for (number, gel), colour in zip(enumerate(study.fits), cycle(GEL_COLOURS)):
         for problem in study.any_fit(gel).problems:
             o = problem.observations
             R_max, t_max, t_c = collapse(o.times, o.values)
-            x, y, colour = (o.times - t_max) / t_c + 1, o.values / R_max, GEL_COLOURS[number % len(GEL_COLOURS)]
+            x, y = (o.times - t_max) / t_c + 1, o.values / R_max
             panel.dots(x, y, colour, 3.0, 0.8, f"{gel} gel", kind="dots" if number else "rings")
     return Chart([Row(0.72 * COLUMN, [panel])])
 
@@ -126,7 +127,7 @@ def distributions(study: Study, route: Route) -> Chart:
         panel = Panel(_label(q), "density per unit of ln" if letter in "ac" else "", title=f"({letter})")
         panel.x_logarithmic, panel.legend = True, letter == "a"
         held = []
-        for gel, dash in zip(study.fits, DASHES, strict=False):
+        for gel, dash in zip(study.fits, cycle(DASHES)):
             for model in ("nh", "qlkv"):
                 fit = study.fits[gel].get(model)
                 if fit is not None and fit.estimated(q.name):
@@ -141,7 +142,7 @@ def distributions(study: Study, route: Route) -> Chart:
 def _density(panel: Panel, values: Array, colour: str, dash: str, label: str) -> None:
     """Smoothed density in ln θ, on a logarithmic axis; its area in ln θ is one."""
     logs = np.log(values)
-    width = max(1.06 * logs.std(ddof=1) * len(logs) ** -0.2, 0.02)
+    width = max(1.06 * logs.std(ddof=min(1, len(logs) - 1)) * len(logs) ** -0.2, 0.02)
     grid = np.linspace(logs.min() - 3 * width, logs.max() + 3 * width, 300)
     z = (grid[:, None] - logs) / width
     density = np.exp(-0.5 * z * z).sum(axis=1) / (len(logs) * width * np.sqrt(2 * np.pi))
@@ -157,11 +158,11 @@ def nrmse_figure(study: Study, route: Route) -> Chart:
     panels: list[Panel] = []
     for model, letter in zip(models, "abc", strict=False):
         panel = Panel("NRMSE", "" if panels else "data sets", title=f"({letter}) {NAMES[model]}", legend=True)
-        for number, gel in enumerate(study.fits):
+        for gel, colour, dash in zip(study.fits, cycle(GEL_COLOURS), cycle(DASHES)):
             fit = study.fits[gel].get(model)
             if fit is not None:
                 counts, label = np.histogram(fit.nrmse(route), edges)[0], f"{gel}: mean {fit.nrmse(route).mean():.3f}"
-                panel.stairs(edges, counts, GEL_COLOURS[number], 0.4, 1.0, DASHES[number], label)
+                panel.stairs(edges, counts, colour, 0.4, 1.0, dash, label)
         panels.append(panel)
     return Chart([Row(0.3 * PAGE, panels)], PAGE)
 
@@ -240,16 +241,14 @@ def evidence(study: Study) -> Chart:
     reach = min(FARTHEST, max(4.0, *(1.1 * np.max(np.abs(c.single)) for c in study.comparisons.values())))
     panel = Panel("Δ log-evidence (neo-Hookean ← 0 → quadratic)", xlim=(-reach, reach), legend=True)
     panel.ylim, panel.yticks, panel.y_names = (-0.5, len(gels) - 0.5), range(len(gels)), [f"{gel} gel" for gel in gels]
-    panel.band([-3, 3], [-0.5, -0.5], np.full(2, len(gels) - 0.5), "grid", 1.0)
+    panel.band([-DECISIVE, DECISIVE], [-0.5, -0.5], np.full(2, len(gels) - 0.5), "grid", 1.0)
     panel.line([0, 0], [-0.5, len(gels) - 0.5], "muted", 0.6)
-    for row, comparison in enumerate(study.comparisons.values()):
+    for (row, comparison), colour in zip(enumerate(study.comparisons.values()), cycle(GEL_COLOURS)):
         height = row + np.linspace(-0.25, 0.25, len(comparison.single))
         inside = np.abs(comparison.single) <= FARTHEST
-        panel.dots(comparison.single[inside], height[inside], GEL_COLOURS[row], 3.2)
+        panel.dots(comparison.single[inside], height[inside], colour, 3.2)
         beyond = comparison.single[~inside]
         if len(beyond):
             words = f"beyond: {', '.join(f'{value:.0f}' for value in beyond)}"
-            panel.dots(
-                0.98 * reach * np.sign(beyond), height[~inside], GEL_COLOURS[row], 4.5, label=words, kind="rings"
-            )
+            panel.dots(0.98 * reach * np.sign(beyond), height[~inside], colour, 4.5, label=words, kind="rings")
     return Chart([Row(0.6 * COLUMN, [panel])])

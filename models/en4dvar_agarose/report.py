@@ -84,7 +84,8 @@ def _apparent_modulus(study: Study, gel: str) -> tuple[float, float] | None:
     if "nh" not in study.fits[gel] or len(true["G"]) < 3:
         return None
     sheet = np.log(true["G"] * true["alpha"] / true["R0"])
-    apparent = np.log(study.fits[gel]["nh"].values("en4dvar", "G"))
+    known = [name in study.truth for name in study.any_fit(gel).names]
+    apparent = np.log(study.fits[gel]["nh"].values("en4dvar", "G")[known])
     return float(np.corrcoef(sheet, apparent)[0, 1]), float(apparent.std())
 
 

@@ -115,7 +115,7 @@ POPULATION = ("G", "alpha", "mu", "R0")
 COMPARED: tuple[Model, Model] = ("nh", "qlkv")
 
 
-def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
+def run_study(plan: StudyPlan, workers: int, say: Say, keep: StudyCheckpoints) -> Study:
     """Compute everything; the truth of a twin is read last and enters no estimate.
 
     ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues. Raises
@@ -124,17 +124,13 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model
     with choose_executor(model, workers=workers) as executor:
-        work = _Parts(plan, executor, say or (lambda message: None), keep, {})
-        with work.timed("sweep"):
-            sweeps = work.sweeps(problems)
-        with work.timed("en4dvar"):
-            fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
-            for (gel, m), sets in problems.items():
-                fits[gel][m] = work.en4dvar(Fit(gel, m, sets, sweeps[gel, m], ()))
-            narrow = {gel: fit for gel, models in fits.items() if (fit := work.narrow(models.get("qlkv")))}
-        with work.timed("population"):
-            populations, comparisons = work.pooled(fits)
-    work.say(f"population and model comparison in {work.seconds['population']:.1f} s")
+        work = _Parts(plan, executor, say, keep, {})
+        sweeps = work.sweeps(problems)
+        fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
+        for (gel, m), sets in problems.items():
+            fits[gel][m] = work.analysed(Fit(gel, m, sets, sweeps[gel, m], ()))
+        narrow = {gel: fit for gel, models in fits.items() if (fit := work.narrow(models.get("qlkv")))}
+        populations, comparisons = work.pooled(fits)
     truth = read_truth(plan.truth) if plan.truth else {}
     return Study(plan, fits, populations, comparisons, truth, work.seconds, narrow)
 
@@ -144,18 +140,14 @@ class _Parts:
     plan: StudyPlan
     executor: Executor
     say: Say
-    keep: StudyCheckpoints | None
+    keep: StudyCheckpoints
     seconds: dict[str, float]
 
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[part] = time.perf_counter() - start
-
-    def kept(self, kind: type[D], compute: Callable[[], D], fit: Fit) -> D:
-        """The result of ``compute``, of now or of before the study was interrupted."""
-        return self.keep.of(kind, compute, fit.gel, fit.model) if self.keep else compute()
+    def tell(self, words: str, part: str, began: float) -> None:
+        """Say what is done, and add the time that it took to that of its part of the study."""
+        spent = time.perf_counter() - began
+        self.seconds[part] = self.seconds.get(part, 0.0) + spent
+        self.say(f"{words} in {spent:.1f} s")
 
     def sweeps(
         self, problems: Mapping[tuple[str, Model], Sequence[InverseProblem]]
@@ -167,35 +159,25 @@ class _Parts:
         sweeps = {}
         for keys in groups.values():
             every, began = one_model([p for key in keys for p in problems[key]]), time.perf_counter()
-            folder = self.keep.sweep(*keys[0]) if self.keep else None
-            result = run_sweep(
-                every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest_reading(every[0].model)
-            )
+            folder, earliest = self.keep.sweep(*keys[0]), earliest_reading(every[0].model)
+            result = run_sweep(every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest)
             first = 0
             for key in keys:
                 sweeps[key] = result.part(slice(first, first + len(problems[key])))
                 first += len(problems[key])
-            words = " and ".join(f"{gel} {model}" for gel, model in keys)
-            spent = time.perf_counter() - began
-            self.say(
-                f"{words}: sweep of {result.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s"
-            )
+            words = f"sweep of {result.trajectories} trajectories against {len(every)} data sets"
+            self.tell(f"{' and '.join(map(' '.join, keys))}: {words}", "sweep", began)
         return sweeps
 
-    def en4dvar(self, fit: Fit) -> Fit:
-        """With the analyses of its problems."""
-        began = time.perf_counter()
-        analyses = self._analysed(fit)
-        spent = time.perf_counter() - began
-        self.say(f"{fit.gel} {fit.model}: En4D-Var of {len(fit.problems)} data sets in {spent:.1f} s")
-        return analyses
-
-    def _analysed(self, fit: Fit) -> Fit:
-        config = self.plan.configs[fit.gel][fit.model]
+    def analysed(self, fit: Fit, prior: str = "") -> Fit:
+        """With the analyses of its problems; ``prior`` says in what it is not that of the configuration."""
+        config, began = self.plan.configs[fit.gel][fit.model], time.perf_counter()
         seeds = (own_seed(config.seed, name) for name in fit.names)
         analyses = tuple(
             assimilate(p, config.assimilation, seed, self.executor) for p, seed in zip(fit.problems, seeds, strict=True)
         )
+        words = f"{fit.gel} {fit.model}{prior}: En4D-Var of {len(fit.problems)} data sets"
+        self.tell(words, "en4dvar", began)
         return replace(fit, analyses=analyses)
 
     def narrow(self, fit: Fit | None) -> Fit | None:
@@ -205,11 +187,12 @@ class _Parts:
             return None
         relative = printed[1] / printed[0]
         terms = tuple(replace(t, std=relative) if t.parameter.name == "R0" else t for t in fit.prior.terms)
-        return self._analysed(replace(fit, problems=tuple(replace(p, prior=Prior(terms)) for p in fit.problems)))
+        narrow = replace(fit, problems=tuple(replace(p, prior=Prior(terms)) for p in fit.problems))
+        return self.analysed(narrow, ", R0 as narrow as printed")
 
     def pooled(self, fits: Mapping[str, dict[Model, Fit]]) -> tuple[dict[str, Population], dict[str, Comparison]]:
         """Populations of the general law and comparisons with the neo-Hookean, a gel each; ``fits`` get evidences."""
-        populations, comparisons = {}, {}
+        populations, comparisons, began = {}, {}, time.perf_counter()
         for gel, models in fits.items():
             for m, fit in models.items():
                 models[m] = replace(fit, sampled=self._sampled(fit))
@@ -218,6 +201,7 @@ class _Parts:
                 populations[gel] = general
             if len(estimates) == len(COMPARED):
                 comparisons[gel] = self._comparison(models, estimates)
+        self.tell("population and model comparison", "population", began)
         return populations, comparisons
 
     def _sampled(self, fit: Fit) -> tuple[OwnDraws, ...]:
@@ -226,7 +210,7 @@ class _Parts:
             with one_blas_thread(), retold(ValueError, TooFewMembersError, "no evidence: "):
                 return OneByOne(tuple(own_draws(p, start, self.plan.seed, self.executor) for p, start in each))
 
-        return self.kept(OneByOne, compute, fit).sampled
+        return self.keep.of(OneByOne, compute, fit.gel, fit.model).sampled
 
     def _population(self, fit: Fit) -> Population | None:
         """None with fewer than 3 data sets."""
@@ -242,7 +226,9 @@ class _Parts:
         pooled = {
             m: math.nan if population is None else population.log_evidence for m, population in populations.items()
         }
-        one_nh, one_general = (self.kept(OneGel, partial(self._one_gel, fit), fit) for fit in (nh, general))
+        one_nh, one_general = (
+            self.keep.of(OneGel, partial(self._one_gel, fit), fit.gel, fit.model) for fit in (nh, general)
+        )
         return Comparison(
             single=general.log_evidence - nh.log_evidence,
             population=pooled["qlkv"] - pooled["nh"],

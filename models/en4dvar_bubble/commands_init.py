@@ -121,9 +121,7 @@ def init(
     name = run_name(str(out or data or movie or "bubble"))  # a file that is called my_gel is run as my_gel
     words = command_line()
     target = out or Path(f"{name}.yaml")
-    refuse_to_replace(True, target, read=[data, movie])
-    if target.exists() and not force:
-        raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
+    refuse_to_replace(force, target, read=[data, movie])
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: the folder {target.parent} does not exist")
     if movie is not None:
@@ -217,8 +215,7 @@ def _table_beside(target: Path, data: str, text: str, force: bool) -> str:
     from en4dvar.plumbing.files import write_text
 
     table = target.with_name(f"{target.stem}_bubbles.csv")
-    if table.exists() and not force:
-        raise OutputError(f"{table}: exists; give --force to replace it, or another --out")
+    refuse_to_replace(force, table)
     write_text(table, text)
     echo(f"table: {table}, a row a bubble of {data}")
     return table.name
@@ -266,7 +263,7 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
         if options["since"] is not None:
             raise click.UsageError(f"{first} has a row a bubble, no readings that --since could leave out")
         return rows
-    if _interactive() and asked.needed():
+    if _interactive():
         asked = _answered(asked)
     if needed := asked.needed():
         again = command_line(also=tuple(word for option, value, _ in needed for word in (option, value)))
@@ -290,19 +287,19 @@ def _interactive() -> bool:
 
 def _answered(asked: Asked) -> Asked:
     """With the columns and units that the options and names do not tell, as the user answers."""
-    columns = list(asked.contents.columns)
-    if asked.radius_column is None:
-        asked = replace(asked, radius_column=click.prompt("Column of radii", type=click.Choice(columns), err=True))
-    if asked.time_step is None:
-        if asked.time_column is None and asked.step is None:
-            asked = replace(asked, time_column=click.prompt("Column of times", type=click.Choice(columns), err=True))
-            asked = asked.of_camera()
-        if asked.time_unit is None:
-            unit = _ask_unit(asked.shown(str(asked.time_column or asked.step)), "s", "us, ms, s or 1/(270*kHz)")
-            asked = replace(asked, time_unit=unit)
-    if asked.radius_unit is None:
-        unit = _ask_unit(asked.shown(str(asked.radius_column)), "m", "um, mm, m, or 2.76*um for pixels")
-        asked = replace(asked, radius_unit=unit)
+    columns = click.Choice(list(asked.contents.columns))
+    while needed := asked.needed():
+        match needed[0][0]:
+            case "--time-column":
+                asked = replace(asked, time_column=click.prompt("Column of times", type=columns, err=True)).of_camera()
+            case "--radius-column":
+                asked = replace(asked, radius_column=click.prompt("Column of radii", type=columns, err=True))
+            case "--time-unit" | "--frame-rate":
+                unit = _ask_unit(asked.shown(str(asked.time_column or asked.step)), "s", "us, ms, s or 1/(270*kHz)")
+                asked = replace(asked, time_unit=unit)
+            case _:
+                unit = _ask_unit(asked.shown(str(asked.radius_column)), "m", "um, mm, m, or 2.76*um for pixels")
+                asked = replace(asked, radius_unit=unit)
     return asked
 
 

@@ -125,6 +125,11 @@ class Medium:
         }
         return json.dumps(told, ensure_ascii=False)
 
+    @property
+    def saturated(self) -> "Medium":
+        """The medium with the saturated vapour pressure at T_inf as a constant one."""
+        return replace(self, p_v=saturated_vapour_pressure(self.T_inf))
+
     def with_constants(self, source: str, **values: float) -> "Medium":
         """The medium with some constants replaced, all from ``source``."""
         changed: dict[str, Any] = dict(values)

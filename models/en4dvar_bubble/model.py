@@ -36,8 +36,7 @@ from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.laws import REGISTRY, get_law
 from en4dvar_bubble.laws.parameters import ALPHA
 from en4dvar_bubble.laws.tabulate import GRID, ends
-from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
-from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
+from en4dvar_bubble.numbers import NAMES, OF_MEDIUM, P_A, WALL_DISTANCE
 from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.arrays import Members
@@ -223,11 +222,11 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 SATURATED, NO_VAPOUR = {"vapour_pressure": "saturated"}, {"vapour_pressure": "'0 Pa'"}
 NEARBY = Wall(3.0, relative=True), "three times R_max"
 NEARBY_DRIVEN = Wall(3e-3), "3 mm"
-MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
+MEDIUM = (  # constant, alternative, factor, words
     ("p_inf", "ambient_pressure", 1.02, "the ambient pressure were 2 % higher"),
     ("rho", "density", 1.03, "the medium were 3 % denser"),
     ("c", "sound_speed", 1.03, "sound were 3 % faster in the medium"),
-    ("surface_tension", "surface_tension", 0.8, "the surface tension were 20 % lower"),
+    ("S", "surface_tension", 0.8, "the surface tension were 20 % lower"),
 )
 
 
@@ -258,17 +257,17 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         return Alternative(name, words, replace(cast(Any, model), **options), options=_as_options(keys))
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
-    if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
+    others = {*model.named, *model.absent_parameters}  # what is a parameter has its own uncertainty
+    if P_A.name not in others:
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
     if stiffens := next((it for it in REGISTRY.values() if (type(model.law), NO_STIFFENING) in it.limits), None):
         words = f"the gel stiffened (law: {stiffens.name}, alpha: {STIFFENED:g})"
         asked = _as_options({"law": stiffens.name}, parameters={ALPHA.name: f"{STIFFENED:g}"})
         yield replace(changed("stiffening", words, law=stiffens()), constants={ALPHA.name: STIFFENED}, options=asked)
-    for name, key, factor, words in MEDIUM:
-        if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
-            of = "S" if name == "surface_tension" else name
-            yield changed(key, words, medium=replace(medium, **{of: factor * getattr(medium, of)}))
+    for constant, key, factor, words in MEDIUM:
+        if OF_MEDIUM[constant].name not in others:
+            yield changed(key, words, medium=replace(medium, **{constant: factor * getattr(medium, constant)}))
     if model.wall is None:
         wall, far = NEARBY if model.start == "laser" else NEARBY_DRIVEN
         yield changed("wall", f"a rigid wall were {far} away (model.wall.distance)", wall=wall)
@@ -277,7 +276,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     else:
         words = "the gas were polytropic (gas: polytropic)"
         of_vapour = model.vapour, NOTHING, medium
-        vapour, said, its = ("none", SATURATED, _saturated(medium)) if model.vapour == "transport" else of_vapour
+        vapour, said, its = ("none", SATURATED, medium.saturated) if model.vapour == "transport" else of_vapour
         yield changed("gas_model", words, said, gas="polytropic", medium_heat="cold", vapour=vapour, medium=its)
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
@@ -285,10 +284,6 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
     yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
     yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")
-
-
-def _saturated(medium: Medium) -> Medium:
-    return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
 
 
 def _of_vapour(model: Dynamics, changed: Callable[..., Alternative]) -> Iterator[Alternative]:
@@ -304,4 +299,4 @@ def _of_vapour(model: Dynamics, changed: Callable[..., Alternative]) -> Iterator
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
     elif "p_v" not in model.named:
         words = "vapour filled the bubble (vapour_pressure: saturated)"
-        yield changed("vapour", words, SATURATED, medium=_saturated(medium))
+        yield changed("vapour", words, SATURATED, medium=medium.saturated)

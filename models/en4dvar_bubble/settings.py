@@ -39,19 +39,12 @@ from en4dvar_bubble.medium import (
     KnownMedium,
     Medium,
     known_medium,
-    saturated_vapour_pressure,
 )
 from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 
-class Section(Described):
-    """A section of a YAML file: unknown keys are errors, the texts under its keys are their descriptions."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Kind(Section):
+class _Kind(Described):
     model_config = ConfigDict(allow_inf_nan=False)
     pulse: ClassVar[Callable[..., Driving]]
     """The function whose arguments are the keys."""
@@ -86,7 +79,7 @@ def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
     return section
 
 
-class _Column(Section):
+class _Column(Described):
     name: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""
     unit: str
@@ -105,7 +98,7 @@ class PressureOfRecord(_Column):
     unit: Annotated[str, text_for(lambda unit: convert(1.0, unit, "Pa"))]
 
 
-class Columns(Section):
+class Columns(Described):
     """Which columns of the file hold time and pressure, and their units."""
 
     time: TimeOfRecord
@@ -179,7 +172,7 @@ _GIVEN = "given in the configuration"
 _VAPOUR_PRESSURE = {"anyOf": [{"const": "saturated"}, {"const": 0}, {"type": "string", "pattern": r"^\s*[\d.]"}]}
 
 
-class _NamedSet(Section):
+class _NamedSet(Described):
     """A named set of constants, any of them replaced."""
 
     set: SetName = "water-25C"
@@ -240,7 +233,7 @@ _CONSTANTS: dict[str, Any] = {**{f.name: _key(f) for f in CONSTANTS}, "sources":
 ConstantsSettings = create_model("ConstantsSettings", __base__=_NamedSet, __doc__=_NamedSet.__doc__, **_CONSTANTS)
 
 
-class MediumSettings(Section):
+class MediumSettings(Described):
     """A medium by name."""
 
     name: MediumName
@@ -263,7 +256,7 @@ class MediumSettings(Section):
         return known_medium(self.name, self.concentration)
 
 
-class WallSettings(Section):
+class WallSettings(Described):
     """A plane near the bubble."""
 
     distance: Annotated[float, Quantity("m"), Field(gt=0)]
@@ -272,7 +265,7 @@ class WallSettings(Section):
     """A rigid wall, the free surface of the medium, or a rigid wall on either side."""
 
 
-class BubbleSettings(Section):
+class BubbleSettings(Described):
     """What the forward model is; every default is recorded in the resolved configuration."""
 
     law: str = "quadratic-kelvin-voigt"
@@ -372,9 +365,8 @@ class BubbleSettings(Section):
     def liquid(self) -> Medium:
         """All constants, with the vapour pressure."""
         medium = self.constants.medium
-        if self.vapour_pressure == "saturated":
-            return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
-        return replace(medium, p_v=float(self.vapour_pressure))
+        saturated = self.vapour_pressure == "saturated"
+        return medium.saturated if saturated else replace(medium, p_v=float(self.vapour_pressure))
 
     @property
     def solver_accuracy(self) -> Accuracy:

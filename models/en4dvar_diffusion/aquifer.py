@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict
 from pydantic import Field as Setting
 from scipy.sparse import csc_matrix, diags, identity
 from scipy.sparse.linalg import splu
@@ -26,7 +25,6 @@ SOURCE = "Bear (1979), Hydraulics of Groundwater, § 5-1"
 class AquiferSettings(Described):
     """The grid, and the steps in time."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     shape: tuple[Side, Side] = (100, 100)
     """Rows and columns of cells, each of side 1."""
     step: Annotated[float, Setting(gt=0)] = 2.0
@@ -83,11 +81,8 @@ class Aquifer(ForwardModel):
     def _heads(self, state: Array, durations: Sequence[float] | Array) -> list[Array]:
         """Heads (n,) after each of the durations, one after the other."""
         head, (recharge, storage) = state[: self.size].copy(), state[-2:]
-        flow, solvers, heads = (
-            self.conductances(state[self.layout["ln_T"]]),
-            dict[float, Callable[[Array], Array]](),
-            [],
-        )
+        flow, heads = self.conductances(state[self.layout["ln_T"]]), list[Array]()
+        solvers: dict[float, Callable[[Array], Array]] = {}
         for duration in durations:
             steps = math.ceil(duration / self.longest - 1e-9)
             rate = float(f"{storage * steps / duration:.12g}") if steps else 0.0  # of times as they are rounded, one

@@ -55,7 +55,8 @@ def test_doubts_about_the_evidence_of_a_gel_leave_it_without_a_verdict(monkeypat
     """Laplace's evidence of one law, from a descent that went on; what is no doubt about a number is not told."""
     codes = {"nh": ("not-converged", "non-gaussian", "data-sets-differ"), "qlkv": ("non-gaussian",)}
     config = SimpleNamespace(assimilation=None)
-    parts = _Parts(SimpleNamespace(configs={"gel": dict.fromkeys(codes, config)}, seed=1), None, print, None, {})
+    keep = SimpleNamespace(of=lambda kind, compute, *words: compute())
+    parts = _Parts(SimpleNamespace(configs={"gel": dict.fromkeys(codes, config)}, seed=1), None, print, keep, {})
     fits = {m: Fit("gel", m, tuple(build(load_config(CONFIGS / f"agarose_10_{m}.yaml"))[:1]), None, ()) for m in codes}
     monkeypatch.setattr(Fit, "log_evidence", np.zeros(1))
     monkeypatch.setattr(run, "sharing", lambda problems, names: names)

@@ -22,10 +22,19 @@ from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar_agarose import report, tables
 from en4dvar_agarose.commands import study as study_command
-from en4dvar_agarose.figures import all_figures, collapse, combined, iterations, population
-from en4dvar_agarose.fits import Fit, OneGel, Study, probability, verdict
+from en4dvar_agarose.figures import (
+    all_figures,
+    collapse,
+    combined,
+    distributions,
+    evidence,
+    iterations,
+    nrmse_figure,
+    population,
+)
+from en4dvar_agarose.fits import Comparison, Fit, OneGel, Study, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
-from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
+from en4dvar_agarose.run import COMPARED, StudyCheckpoints, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 from en4dvar_bubble.dynamics import R0
 from en4dvar_bubble.laws.parameters import MU, G
@@ -283,6 +292,42 @@ def test_a_parameter_that_is_held_fixed_has_no_panel_and_no_interval():
     assert before == pytest.approx(members / 5, rel=0.3)  # densities of the same numbers, five times as wide
 
 
+def test_figures_of_more_gels_than_colours_show_every_one():
+    """The fifth was left out of the distributions, and an IndexError ended the study at its end."""
+    problem = SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={})
+    sweep = SimpleNamespace(parameters=(G,), theta=np.array([[1.0], [2.0], [3.0]]), nrmse=np.array([0.95, 0.96, 0.97]))
+    gels = [f"{n} %" for n in range(5)]
+    fits = {gel: {"qlkv": Fit(gel, "qlkv", (problem,) * 3, sweep, ())} for gel in gels}
+    comparisons = {gel: Comparison(np.array([1.0, 99.0]), 0.0, 0.0, (1.0, 1.0), ()) for gel in gels}
+    told = Study(None, fits, {}, comparisons, {})
+    charts = distributions(told, "sweep"), nrmse_figure(told, "sweep"), evidence(told)
+    assert [len(chart.rows[0].panels[0].marks) for chart in charts] == [10, 10, 2 + 10]
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_distribution_of_one_data_set_is_a_peak():
+    """It was a line of NaN, and numpy's RuntimeWarning was printed."""
+    problem = SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={})
+    sweep = SimpleNamespace(parameters=(G,), theta=np.array([[1e3]]), nrmse=np.array([0.95]))
+    told = Study(None, {"1 %": {"qlkv": Fit("1 %", "qlkv", (problem,), sweep, ())}}, {}, {}, {})
+    line, _ = distributions(told, "sweep").rows[0].panels[0].marks
+    assert line.x[np.argmax(line.y)] == pytest.approx(1.0, rel=0.01)  # kPa
+
+
+def test_the_apparent_modulus_is_that_of_the_sets_whose_truth_is_known():
+    """With a truth of fewer data sets a ValueError of numpy ended the study at its end."""
+    rng, names = np.random.default_rng(2), ["a", "b", "c", "d", "e"]
+    problems = tuple(
+        SimpleNamespace(prior=Prior([PriorTerm.lognormal(G, 1.0, 0.5)]), fixed={}, observations=SimpleNamespace(name=n))
+        for n in names
+    )
+    truth = {name: {"G": rng.uniform(1, 2), "alpha": 1.0, "R0": 1.0} for name in names[1:]}
+    analyses = tuple(SimpleNamespace(posterior=np.full((3, 1), truth.get(name, {"G": 9.0})["G"])) for name in names)
+    told = Study(None, {"1 %": {"nh": Fit("1 %", "nh", problems, None, analyses)}}, {}, {}, truth)
+    correlation, _ = report._apparent_modulus(told, "1 %")
+    assert correlation == pytest.approx(1.0)
+
+
 def test_collapse_of_a_known_history():
     times = np.arange(0.0, 20.0, 1.0)
     radius = 100 - (times - 9.3) ** 2
@@ -306,13 +351,18 @@ def twin(tmp_path_factory):
     """Every other data set of the twin; nobody here asks for populations, what all bubbles of a gel share, and the
     evidence of the law that is not compared.
     """
-    file = write_study(tmp_path_factory.mktemp("twin"), "*[02468]")
-    with pytest.MonkeyPatch.context() as patch:
+    folder = tmp_path_factory.mktemp("twin")
+    plan = load_study(write_study(folder, "*[02468]"), {"sweep.trajectories": 8192})
+    who = identity_of(plan.seed, plan.sweep, plan.named)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        StudyCheckpoints.open(folder / "out", force=False, resume=False, who=who, files=report.FILES) as keep,
+    ):
         sampled = _Parts._sampled
         patch.setattr(_Parts, "_sampled", lambda parts, fit: sampled(parts, fit) if fit.model in COMPARED else ())
         patch.setattr(_Parts, "_population", lambda *_: None)
         patch.setattr(_Parts, "_one_gel", lambda *_: OneGel(np.nan, np.nan))
-        return run_study(load_study(file, {"sweep.trajectories": 8192}), workers=2)
+        return run_study(plan, 2, print, keep)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
+from en4dvar_bubble.dynamics import MACH_LIMITS
 from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -151,6 +152,12 @@ def test_alternatives_can_be_made_for_any_options(options):
     others = [one.model for one in model.alternatives if one.model is not None]
     assert others
     assert all([p.name for p in other.parameters] == [p.name for p in model.parameters] for other in others)
+
+
+def test_what_the_equations_do_not_contain_is_no_alternative():
+    """Of an incompressible liquid the speed of sound was told to make no difference, for the price of a forecast."""
+    offered = {radial: [one.name for one in BubbleModel(radial=radial).alternatives] for radial in MACH_LIMITS}
+    assert [radial for radial, names in offered.items() if "sound_speed" not in names] == ["rayleigh-plesset"]
 
 
 def test_of_the_fullest_physics_every_part_could_be_simpler():

@@ -66,11 +66,15 @@ def test_wrong_options(tmp_path: Path, options: tuple[str, ...], message: str) -
 
 def test_on_a_terminal_it_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands_init, "_interactive", lambda: True)
-    done = call("init", "--data", write(tmp_path / "b.csv", "when,size"), input="size\nwhen\nus\nPa\num\n")
+    done = call("init", "--data", write(tmp_path / "b.csv", "when,size"), input="when\nus\nsize\nPa\num\n")
     assert done.exit_code == 0, done.output
     assert "unit 'Pa' cannot be converted to 'm'" in done.stderr  # asked again
     columns = proposed(Path("b.yaml")).document.data["data"]["columns"]
     assert columns == {"time": {"name": "when", "unit": "us"}, "radius": {"name": "size", "unit": "um"}}
+    frames = ("--data", write(tmp_path / "f.csv", "frame,radius"), "--time-unit", "frame")
+    done = call("init", *frames, input="1/(1.4*MHz)\num\n")  # how long one is no option tells
+    assert done.exit_code == 0, done.output
+    assert "time: {name: frame, unit: 1/(1.4*MHz)}" in Path("f.yaml").read_text().replace('"', "")
 
 
 def test_nothing_is_replaced_without_force(tmp_path: Path) -> None:
@@ -78,7 +82,7 @@ def test_nothing_is_replaced_without_force(tmp_path: Path) -> None:
     assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
     Path("b.yaml").write_text("mine")
     done = call("init", "--data", "b.csv", *UNITS)
-    assert (done.exit_code, done.stderr) == (2, "b.yaml: exists; give --force to replace it, or another --out\n")
+    assert (done.exit_code, done.stderr) == (2, "b.yaml: exists; give --force to replace it, or another name\n")
     assert Path("b.yaml").read_text() == "mine"
     assert call("init", "--data", "b.csv", *UNITS, "--force").exit_code == 0
     assert proposed(Path("b.yaml")).document.data["data"]["path"] == "b.csv"

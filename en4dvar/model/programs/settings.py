@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
 from en4dvar.model.programs import languages
 from en4dvar.model.programs.languages import TIMES, ProgramError, check_template, input_name
@@ -87,11 +87,7 @@ Templates = Annotated[
 Instructions = dict[Annotated[str, AfterValidator(_inside)], Files]
 
 
-class _Section(Described):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
-
-
-class ParameterOf(_Section):
+class ParameterOf(Described):
     """A parameter of the program."""
 
     unit: Unit = "1"
@@ -114,7 +110,7 @@ class ParameterOf(_Section):
         return self
 
 
-class OutputOf(_Section):
+class OutputOf(Described):
     """Where the values of an observable are: one of column, key, pattern, instructions."""
 
     unit: Unit = "1"
@@ -212,7 +208,7 @@ def _folder(folder: Path, info: ValidationInfo) -> Path:
     return path
 
 
-class CommandSettings(_Section):
+class CommandSettings(Described):
     """A program as forward model: how it is called, what goes in, what comes out."""
 
     shell: bool = False

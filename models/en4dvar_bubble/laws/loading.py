@@ -30,14 +30,13 @@ def check_law(kind: Any, name: str) -> ConstitutiveLaw:
     """An instance of the class ``kind``. Raises :class:`ConfigError` saying what is wrong with it."""
     if not (isinstance(kind, type) and issubclass(kind, ConstitutiveLaw)):
         raise ConfigError(f"{name}: not a subclass of en4dvar_bubble.ConstitutiveLaw")
-    _check_elastic(kind, name)
-    _check_parameters(kind, name)
     law: ConstitutiveLaw = _run(kind, f"{name}: cannot be created without arguments")
+    _check_declared(kind, law, name)
     _probe(law, name)
     return law
 
 
-def _check_elastic(kind: type[ConstitutiveLaw], name: str) -> None:
+def _check_declared(kind: type[ConstitutiveLaw], law: ConstitutiveLaw, name: str) -> None:
     own = [m for m in ("stress", "strain_energy_rate") if getattr(kind, m) is not getattr(ConstitutiveLaw, m)]
     if len(own) == 2:
         raise ConfigError(f"{name}: defines both stress and strain_energy_rate; keep one (the other follows from it)")
@@ -46,17 +45,12 @@ def _check_elastic(kind: type[ConstitutiveLaw], name: str) -> None:
             f"{name}: defines neither stress(stretch, p) nor strain_energy_rate(stretch, p); "
             "a law without a spring is a subclass of en4dvar_bubble.Liquid"
         )
-
-
-def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
-    if not (isinstance(kind.parameters, tuple) and all(isinstance(p, Parameter) for p in kind.parameters)):
-        raise ConfigError(f"{name}: parameters must be a tuple of en4dvar.Parameter")
-    if kind.viscosity is not ConstitutiveLaw.viscosity and (
-        kind.strained_viscosity is not ConstitutiveLaw.strained_viscosity
-    ):
+    if law.shear_dependent and law.strain_dependent:
         raise ConfigError(
             f"{name}: defines both viscosity and strained_viscosity; no viscosity depends on shear rate and stretch"
         )
+    if not (isinstance(kind.parameters, tuple) and all(isinstance(p, Parameter) for p in kind.parameters)):
+        raise ConfigError(f"{name}: parameters must be a tuple of en4dvar.Parameter")
     if not kind.parameters:
         raise ConfigError(f"{name}: parameters is empty")
     require_parameters(kind, name)

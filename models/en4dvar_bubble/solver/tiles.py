@@ -186,13 +186,11 @@ def _rest(a, where, x, i, first, last):
 @called
 def solve(a, where, places, x, b, row):
     """Solve in place for the right-hand side of the unknowns in rows ``row …`` of ``b``; ``x`` is scratch."""
-    size, unknown = len(where), 0
+    size = len(where)
     for i in range(size * EDGE):
-        value = splat(0.0)
-        if unknown < len(places) and places[unknown] == i:
-            value = load(b, row + unknown)
-            unknown += 1
-        store(x, i, value)
+        store(x, i, 0.0)
+    for i in range(len(places)):
+        store(x, places[i], load(b, row + i))
     for i in range(1, size):
         _keep(x, i * EDGE, _rest(a, where, x, i, 0, i))
     for i in range(size - 1, -1, -1):

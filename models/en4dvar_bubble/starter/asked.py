@@ -235,18 +235,15 @@ def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Con
         if count >= LOOKED_AT and alike:
             break
         try:
-            contents, with_commas = (read_contents(file, signs) for signs in (points, commas))
+            either = [(file, read_contents(file, signs), signs) for signs in (points, commas)]
         except DataError as error:
             faults.append(str(error))
             continue
-        if len(with_commas.columns) > len(contents.columns):
-            template = (file, with_commas, commas)
+        template = max(either, key=lambda it: len(it[1].columns))  # points where both are alike
+        if columns := template[1].columns:
+            alike.setdefault(tuple(columns), []).append(template)
         else:
-            template = (file, contents, points)
-        if template[1].columns:
-            alike.setdefault(tuple(template[1].columns), []).append(template)
-        else:
-            faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+            faults.append(next(iter(template[1].others.values()), f"{file}: no column holds numbers"))
     if not alike:
         raise DataError("\n".join(faults))
     return max(alike.values(), key=len)[0]

@@ -278,14 +278,11 @@ def _delays(readings: Mapping[str, Readings], source: Source) -> tuple[dict[str,
 def _with_delay(proposal: Proposal, delay: Mapping[str, str]) -> Proposal:
     """With the clock of each file that begins at its ``delay``, unless it begins at the file's own top."""
     words = "the delay that each file states; what is added to it puts the R_max of the guess on that of the data"
-
-    def with_it(line: Entry) -> Entry:
-        plus = None if line.value == "file" else line.value
-        return replace(line, value=braced(**delay, plus=plus), comment=words)
-
-    if not delay:
-        return proposal
-    lines = [with_it(it) if it.key == "time_zero" and it.value != "top" else it for it in proposal.data]
+    lines = list(proposal.data)
+    for i, line in enumerate(lines):
+        if delay and line.key == "time_zero" and line.value != "top":
+            plus = None if line.value == "file" else line.value
+            lines[i] = replace(line, value=braced(**delay, plus=plus), comment=words)
     return replace(proposal, data=tuple(lines))
 
 

@@ -183,15 +183,15 @@ def centred(model: BubbleModel, medium: str) -> BubbleModel:
     return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
 
 
-def of_water(rest: str) -> tuple[Entry, Entry]:
-    """Priors of the viscosity and of R_eq, its median as text. What damps a collapse in water is sound, heat
+def of_water(rest: str) -> dict[str, Entry]:
+    """Priors of the viscosity and of R_eq, its median as text, by key. What damps a collapse in water is sound, heat
     and vapour, so that a guess from collapse and rebound books them as viscosity.
     """
     off = math.exp(1.645 * 1.5)
     words = f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know"
     of_rest = "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know"
     mu = Entry("mu", "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}", words)
-    return mu, Entry("R_eq", f"{{prior: lognormal, median: {rest}, log_std: 1}}", of_rest)
+    return {"mu": mu, "R_eq": Entry("R_eq", f"{{prior: lognormal, median: {rest}, log_std: 1}}", of_rest)}
 
 
 def wall(radius: float, slowness: float) -> tuple[Entry, Entry]:
@@ -222,7 +222,7 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
     if not slow:
         return []
     ratio, usual, radius = np.median([*slow.values()], axis=0)
-    names = f"{', '.join([*slow][:3])}{f' and {len(slow) - 3} more' if len(slow) > 3 else ''}: " * (len(views) > 1)
+    names = f"{listed(slow, 3)}: " * (len(views) > 1)
     near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
     return [
         f"{names}the collapse takes {ratio:.2f} of the Rayleigh time; in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "

@@ -15,7 +15,7 @@ alone, and a G that fits with α and R0 at their medians would count what is kno
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,9 +51,9 @@ class Guess:
     ``G`` nor ``mu`` or no node could be run.
     """
 
-    values: Mapping[str, float]
-    log_std: Mapping[str, float]
-    misfit: float
+    values: Mapping[str, float] = field(default_factory=dict)
+    log_std: Mapping[str, float] = field(default_factory=dict)
+    misfit: float = 0.0
     source: str = ""
     unmatched: tuple[str, ...] = ()
 
@@ -70,7 +70,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
     """
     names = [name for name in GRID if any(p.name == name for p in model.parameters)]
     if not names:
-        return Guess({}, {}, 0.0)
+        return Guess()
     if model.start == "laser":  # whose equations are many; an order of magnitude needs no more
         model = replace(model, accuracy=preset("fast", "laser"))
     nodes = np.array(list(itertools.product(*(GRID[name] for name in names))))
@@ -91,7 +91,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
             off = np.fmin(off, np.abs(terms))
     unmatched = tuple(k for k, least in zip(keys, off, strict=True) if least > FAR) or tuple(keys)
     if not np.any(np.isfinite(misfit)):
-        return Guess({}, {}, float("inf"), unmatched=unmatched)
+        return Guess(misfit=float("inf"), unmatched=unmatched)
     logs, known = np.log(nodes), np.zeros(len(nodes))
     if "G" in names:
         known = sum(((logs[:, i] - np.log(OF_GELS[n][0])) / OF_GELS[n][1]) ** 2 for i, n in enumerate(names))

@@ -39,27 +39,23 @@ CHOSEN, ONE_SIDED = 1.3, 2.5  # errors of a window that the readings chose thems
 
 @dataclass(frozen=True)
 class Top:
-    """``time`` (s) and ``height`` (m) of the maximum, and their standard errors.
-
-    ``reading`` is the number of the largest reading, bad ones left out.
-    """
+    """``time`` (s) and ``height`` (m) of the maximum, and their standard errors."""
 
     time: float
     height: float
     time_std: float
     height_std: float
-    reading: int
 
 
 def top(times: Array, radius: Array, scatter: float) -> Top:
     """Of a history ``times`` (K,) s, ``radius`` (K,) m without bad readings, whose errors have the std ``scatter``."""
-    reading, late, estimates = int(np.argmax(radius)), math.nan, list[tuple[Array, Array]]()
+    late, estimates = math.nan, list[tuple[Array, Array]]()
     with suppress(DataError):
         excursion = lobe(times, radius)
         late, estimates = LATE * excursion.t_c, list(_estimates(times, radius, scatter, excursion))
     if not estimates:  # a few readings between which anything may lie, or a history that begins behind the top
-        height, time_std = float(radius[reading]), float(np.fmax(np.median(np.diff(times)), late))
-        return Top(float(times[reading]), height, time_std, 0.03 * height, reading)
+        height, time_std = float(radius.max()), float(np.fmax(np.median(np.diff(times)), late))
+        return Top(float(times[np.argmax(radius)]), height, time_std, 0.03 * height)
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     chosen = estimates[0]
     for value, std in estimates:
@@ -71,7 +67,7 @@ def top(times: Array, radius: Array, scatter: float) -> Top:
     value, std = chosen
     wider = CHOSEN if np.sum(times < value[0]) > 1 else ONE_SIDED
     time_std, height_std = wider * std
-    return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std), reading)
+    return Top(float(value[0]), float(value[1]), float(np.fmin(time_std, late)), float(height_std))
 
 
 def _estimates(times: Array, radius: Array, scatter: float, excursion: Lobe) -> Iterator[tuple[Array, Array]]:
@@ -231,10 +227,10 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     _require_collapse(radius, start)
     scatter = scatter_of(times, radius)
     rests = before(times, radius, scatter)
-    seen = _before_a_hole(times, radius)
+    seen, lost = _before_a_hole(times, radius)
     peak = _lobe(times[:seen], radius[:seen], start != "laser" and np.isfinite(rests[0]))
     highest = top(times[:seen], radius[:seen], scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
-    largest = highest.reading
+    largest = int(np.argmax(radius[:seen]))
     prominence, n_minima = _minima(with_unseen(times[largest:], radius[largest:])[1], scatter)
     rebound = second_maximum(radius)
     begins = _begins(radius, largest)
@@ -259,8 +255,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     early, hole = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c), ""
     if seen < len(times) and chosen == "laser":
         early, rebound = True, float("nan")
-        hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses; "
-        hole += UNCOUNTED if _unseen(times, radius) is None else COUNTED
+        hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses; {lost}"
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, _trough(radius[largest:], rebound), rests,
         n_minima, prominence, falls, chosen == "laser" and not hole and (early or single(times, radius)), early,
@@ -346,18 +341,22 @@ def _lobe(times: Array, radius: Array, rests: bool) -> Lobe:
         return Lobe(float(radius[top]), float(times[top]), float(times[lowest[0]] - times[top]))
 
 
-def _before_a_hole(times: Array, radius: Array) -> int:
-    """How many readings precede a hole of several steps in which a bubble collapses and its rebound has a top; all."""
+def _before_a_hole(times: Array, radius: Array) -> tuple[int, str]:
+    """How many readings precede a hole of several steps in which a bubble collapses and its rebound has a top, and what
+    that does to a window, in words; else all, and "".
+    """
     largest, steps = int(np.argmax(radius)), np.diff(times)
-    if (at := _unseen(times, radius)) is not None:
-        return int(np.searchsorted(times, at))
+    t, r = with_unseen(times[largest:], radius[largest:])
+    first = t[minima(r)[:1]]
+    if len(first) and first[0] not in times:
+        return int(np.searchsorted(times, first[0])), COUNTED
     for last in largest + np.flatnonzero(steps[largest:] > SEVERAL * np.median(steps))[:1]:
         with suppress(DataError):  # too few to tell
             peak = lobe(times[: last + 1], radius[: last + 1])
             hidden = times[last] < peak.t_max + peak.t_c < times[last + 1] - REBOUND * peak.t_c
             if hidden and radius[last] < FALLS * radius[largest]:
-                return int(last) + 1
-    return len(times)
+                return int(last) + 1, UNCOUNTED
+    return len(times), ""
 
 
 def _shots(times: Array, radius: Array, peak: Lobe) -> Iterator[int]:
@@ -370,13 +369,6 @@ def _shots(times: Array, radius: Array, peak: Lobe) -> Iterator[int]:
         start, stop = np.searchsorted(times, times[first] - np.array([begun, ended]) * peak.t_c)
         if (quiet := radius[min(start, stop - 1) : stop].max()) < QUIET * largest:
             yield int(np.flatnonzero(radius[:first] <= quiet)[-1]) + 1
-
-
-def _unseen(times: Array, radius: Array) -> float | None:
-    """When the first minimum behind the maximum is, if it is one that no reading shows and that a window counts."""
-    t, r = with_unseen(times[(largest := int(np.argmax(radius))) :], radius[largest:])
-    first = t[minima(r)[:1]]
-    return float(first[0]) if len(first) and first[0] not in times else None
 
 
 def _require_collapse(radius: Array, start: Start | None) -> None:

@@ -137,18 +137,18 @@ def propose(
     if doubted:
         warnings += doubted
         possible = all(conceivable(view.lobe, model.medium) for view in views)
-        believed = guess.common() if possible else Guess({}, {}, 0.0)
+        believed = guess.common() if possible else Guess()
     elif words := _implausible(look, model.law.sized):
         warnings.append(words)
     elif guess.misfit > FAR and chosen == "laser":  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
     elif guess.misfit > FAR:
-        believed = Guess({}, {}, 0.0)  # made with an example of a pulse
+        believed = Guess()  # made with an example of a pulse
     warnings += without_rebound(looks) if chosen == "laser" else elsewhere.clocks_apart(looks)
     if chosen == "laser" and "G" in guess.values:
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     elif "G" in guess.values:
-        believed = Guess({}, {}, 0.0)  # of a gel that a pulse stretches, readings tell G α/R0 alone
+        believed = Guess()  # of a gel that a pulse stretches, readings tell G α/R0 alone
     slow = (elsewhere.SLOW_IN_WATER if medium == "water" else elsewhere.SLOW[0]) < ratio < elsewhere.SLOW[1]
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
@@ -402,23 +402,17 @@ def _parameters(
     scale: elsewhere.Known,
     rest: tuple[str, float] | None,
 ) -> tuple[Entry, ...]:
-    start, lines = model.start, []
-    in_water = medium == "water" and _in_a_liquid(model)
-    water = {line.key: line for line in elsewhere.of_water(_of_each(0.05 * look.lobe.R_max, look, top)) if in_water}
-    if medium == "water" and model.law.sized:
-        water["mu"] = elsewhere.MU_OF_WATER
-    for p in model.law.parameters:
-        if p.name in water:
-            lines.append(water[p.name])
-        elif p.name in guess.values:
+    start, lines = model.start, [example(p, model) for p in model.law.parameters]
+    for i, p in enumerate(model.law.parameters):
+        if p.name in guess.values:
             width = float(np.clip(guess.log_std[p.name], *WIDTHS[p.name]))
-            lines.append(_spread(p, guess.values[p.name], width, f"{guess.source},", "knew before"))
-        else:
-            lines.append(example(p, model))
-    radii = {line.key: line for line in _radii(start, look, top, rest)}
-    if R_EQ.name in water and not np.isfinite(look.rest):
-        radii[R_EQ.name] = water[R_EQ.name]
-    lines += radii.values()
+            lines[i] = _spread(p, guess.values[p.name], width, f"{guess.source},", "knew before")
+    lines += _radii(start, look, top, rest)
+    if medium == "water":
+        water = elsewhere.of_water(_of_each(0.05 * look.lobe.R_max, look, top)) if _in_a_liquid(model) else {}
+        water |= {"mu": elsewhere.MU_OF_WATER} if model.law.sized else {}
+        seen = {R_EQ.name} if np.isfinite(look.rest) else set()
+        lines = [line if line.key in seen else water.get(line.key, line) for line in lines]
     pulse = elsewhere.example_pulse(model.law)
     lines += [elsewhere.amplitude(pulse)] * (start == "acoustic")
     mean, std = (_text(value, "s", "us", digits) for value, digits in zip(top.t_s, (4, 2), strict=True))
