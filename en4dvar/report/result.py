@@ -128,7 +128,7 @@ class Result(StoredResult):
             groups = {name: _in_display_units(group) for name, group in groups.items()}
         if chains != 1 or 0 < self.alive.sum() < len(self.alive):
             groups = {name: self._dealt(group, chains) for name, group in groups.items()}
-        known = getattr(arviz, "InferenceData", None)
+        known = vars(arviz).get("InferenceData")  # asked for as an attribute, it is a warning from version 1.3 on
         if known is None or isinstance(self.tree, known):
             from xarray import DataTree
 
