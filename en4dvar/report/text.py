@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -227,11 +228,9 @@ def symbol_html(symbol: str) -> Markup:
     >>> str(symbol_html(r"$\mu$")), str(symbol_html(r"$R_{\mathrm{eq}}$")), str(symbol_html("<b>"))
     ('<i>μ</i>', '<i>R</i><sub>eq</sub>', '&lt;b&gt;')
     """
-    if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
-        return escape(symbol)
-    tags = {"_": "sub", "^": "sup", "": "i"}
-    pieces = ((tags[mark], piece) for mark, piece in math_pieces(symbol[1:-1]))
-    return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) for tag, piece in pieces)
+    tags = {"_": "sub", "^": "sup", "i": "i"}
+    parts = ((tags.get(mark), piece) for mark, piece in pieces(symbol))
+    return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) if tag else piece for tag, piece in parts)
 
 
 def with_symbols(words: str) -> Markup:
@@ -240,8 +239,7 @@ def with_symbols(words: str) -> Markup:
     >>> str(with_symbols(r"$\mu$ of a < b")), str(with_symbols(r"$G$ · $\alpha$^0.23"))
     ('<i>μ</i> of a &lt; b', '<i>G</i> · <i>α</i><sup>0.23</sup>')
     """
-    within = re.sub(r"\$\^(−?[\d.]+)", r"^{\1}$", words)
-    return Markup("").join(symbol_html(part) for part in re.split(r"(\$[^$]+\$)", within))
+    return symbol_html(re.sub(r"\$\^(−?[\d.]+)", r"^{\1}$", words))
 
 
 def without_folders(text: object) -> str:
@@ -253,14 +251,23 @@ def without_folders(text: object) -> str:
     return re.sub(r"(?<![^\s'\"])(?:[A-Za-z]:)?[\\/](?=[^\s\\/])(?:[^\\/\n'\",]+[\\/])+", "…/", str(text))
 
 
-def math_pieces(body: str) -> list[tuple[str, str]]:
-    r"""What stands between two dollar signs: ("", base), ("_", index) and ("^", exponent) in order.
+def pieces(text: str) -> Iterator[tuple[str, str]]:
+    r"""Text with symbols between dollar signs: ("", words), ("i", base), ("_", index) and ("^", exponent) in order.
 
-    >>> math_pieces(r"R_{\mathrm{eq}}")
-    [('', 'R'), ('_', 'eq')]
+    >>> list(pieces(r"at $R_{\mathrm{eq}}$ for 5 \$"))
+    [('', 'at '), ('i', 'R'), ('_', 'eq'), ('', ' for 5 $')]
     """
+    for i, part in enumerate(re.split(r"(?<!\\)\$([^$]+)\$", text)):
+        if i % 2:
+            yield from _of_math(part)
+        elif part:
+            yield "", part.replace(r"\$", "$")
+
+
+def _of_math(body: str) -> list[tuple[str, str]]:
+    """What stands between two dollar signs."""
     body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
     body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], f"{m[1]} "), body).rstrip()
-    pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
-    return [(mark, index.strip("{} ") or base.strip("{}")) for mark, index, base in pieces]
+    parts = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
+    return [(mark or "i", index.strip("{} ") or base.strip("{}")) for mark, index, base in parts]
