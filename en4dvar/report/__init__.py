@@ -5,7 +5,7 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
@@ -54,45 +54,33 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
     stored = RunResults(run_dir)
-    if stored.files == [stored.whole]:
-        result = load_stored(stored.whole)
-        _require_known(run_dir, datasets, [result.name])
-        write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
-        _write_tables(run_dir, [_lines(result)])
-        folder = inside(run_dir, "figures") if files else None
-        return write_text(run_dir / "report.html", render_set(result, folder=folder))
     sets, lines = [], []
     for path, result in stored:
         sets.append(SetSummary.of(result, path.name))
         lines.append(_lines(result))
     if not sets:
         stored.require()
-    _write_tables(run_dir, lines)
     stems = {s.name: s.stem for s in sets}
-    _require_known(run_dir, datasets, stems)
-    failures = failed_datasets(stored.whole) | stored.lacking
+    for name in datasets:
+        if name not in stems:
+            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
+    for (table, (columns, _)), parts in zip(TABLES.items(), zip(*lines, strict=True), strict=True):
+        if rows := [*chain(*parts)]:
+            write_csv(run_dir / table, [("dataset", *columns), *rows])
+    single = stored.files == [stored.whole]
+    failures = {} if single else failed_datasets(stored.whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
+    if single:
+        folder = inside(run_dir, "figures") if files else None
+        return write_text(run_dir / "report.html", render_set(result, folder=folder))
     page = _write_campaign(run_dir, sets, failures, {stems[name] for name in datasets}, workers, files)
     stored.require(page)
     return page
 
 
-def _require_known(run_dir: Path, names: Sequence[str], known: Collection[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, known)}")
-
-
 def _lines(result: StoredResult) -> list[list[Line]]:
     """Of each of :data:`TABLES`, the name of the data set first."""
     return [[(result.name, *line[: len(columns)]) for line in lines(result)] for columns, lines in TABLES.values()]
-
-
-def _write_tables(run_dir: Path, sets: Sequence[list[list[Line]]]) -> None:
-    """The :data:`TABLES` of the data sets, where there is something to write."""
-    for (name, (columns, _)), parts in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
-        if lines := [*chain(*parts)]:
-            write_csv(run_dir / name, [("dataset", *columns), *lines])
 
 
 def _write_campaign(
