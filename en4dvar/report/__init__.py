@@ -20,7 +20,7 @@ from en4dvar.report.figures import PIECE_COLUMNS, stored_walks
 from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
 from en4dvar.report.page import Headline, SetSummary, overview_figures, render_overview, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
-from en4dvar.report.svg import draw, svg
+from en4dvar.report.svg import draw
 from en4dvar.report.text import upper_first
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.pack import PACK
@@ -107,8 +107,8 @@ def _write_campaign(
     of_gel = {name for _, of in populations_of(run_dir).values() for name in of.names}
     figures = draw(overview_figures(sets, of_gel), folder=inside(run_dir, "figures") if files else None)
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    shown = {"pages": pages, "failures": failures, "figures": figures, "headlines": _headlines(run_dir)}
-    return write_text(run_dir / "report.html", render_overview(sets, **shown))
+    shown = {"pages": pages, "failures": failures, "figures": figures}
+    return write_text(run_dir / "report.html", render_overview(sets, _headlines(run_dir), **shown))
 
 
 def _headlines(run_dir: Path) -> list[Headline]:
@@ -118,22 +118,22 @@ def _headlines(run_dir: Path) -> list[Headline]:
     headlines: list[Headline] = []
     groups = populations.groups_compared(run_dir)
     if isinstance(groups, str):
-        headlines.append(("summary.csv", "All data sets", [groups], "", "", ()))
+        headlines.append(("summary.csv", "All data sets", [groups], [], ()))
     elif groups is not None:
         populations.write_tables(groups, run_dir)
-        drawn = svg(populations.figure(groups), "populations", groups.caption)
         told = [*populations.group_sentences(groups, groups.symbols)]
-        headlines.append(("differences.csv", "The differences", told, drawn, groups.caption, ()))
+        figures = [("populations", groups.caption, populations.figure(groups))]
+        headlines.append(("differences.csv", "The differences", told, figures, ()))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population of all data sets"
         told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of, of.symbols)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
-        headlines.append((address, words, told, together.population_figure(of), together.caption(of), of.cautions))
+        headlines.append((address, words, told, [together.population_figure(of)], of.cautions))
     if (run_dir / JOINT).exists():
         shared = load_joint(run_dir / JOINT)
         lines = [upper_first(line) for line in together.joint_lines(shared)]
-        figure, caption = together.joint_figure(shared), together.joint_caption(shared)
-        headlines.append(("joint.html", "All of them together", lines, figure, caption, shared.cautions))
+        figures = [together.joint_figure(shared)]
+        headlines.append(("joint.html", "All of them together", lines, figures, shared.cautions))
     return headlines
 
 

@@ -25,7 +25,6 @@ from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, plain_number
 from en4dvar.results.declared import Names
 
@@ -265,11 +264,11 @@ def curves(calibration: Calibration) -> Chart:
 def write_calibration(folder: Path) -> Path:
     """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
     calibration = load_calibration(folder)
-    figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
+    figures = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
     quantities = tuple((calibration.written[name], unit) for name, unit in calibration.quantities)
     written = replace(calibration, quantities=quantities)
     about = {"calibration": written, "head": HEAD, "level": LEVEL, "configuration": _configuration(folder)}
-    return write_page(folder, "calibration", figures=draw(figures), **about)
+    return write_page(folder, "calibration", figures, **about)
 
 
 def load_calibration(folder: Path) -> Calibration:

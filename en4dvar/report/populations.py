@@ -28,7 +28,6 @@ from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
 from en4dvar.results.declared import NAMES, Names
 from en4dvar.results.netcdf import understood
@@ -383,10 +382,10 @@ def figure(c: PopulationsCompared) -> Chart:
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     """Write ``compare.html``, ``populations.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
-    ((_, _, drawn),) = draw([("populations", c.caption, figure(c))], folder=out)
     write_tables(c, out)
     title, told = " – ".join(c.populations), tuple(sentences(c, c.symbols))
-    return write_page(out, "compare", title=title, populations=told, figure=drawn, caption=c.caption)
+    figures = [("populations", c.caption, figure(c))]
+    return write_page(out, "compare", figures, out, title=title, populations=told)
 
 
 def write_tables(c: PopulationsCompared, folder: Path) -> None:

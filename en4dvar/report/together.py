@@ -22,7 +22,7 @@ from en4dvar.report import text
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import write_page
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import Captioned
 from en4dvar.results.declared import NAMES, Names, parameter_of
 from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
@@ -101,15 +101,12 @@ def joint_lines(joint: StoredJoint) -> list[str]:
     return lines
 
 
-def joint_figure(joint: StoredJoint) -> str:
-    """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
+def joint_figure(joint: StoredJoint) -> Captioned:
+    """All data sets over what they share; without what the data leave as it was stated, where there is more."""
     held = [name for name in joint.shared if name in joint.rest]
     shared = {name: joint.rest[name] for name in [n for n in held if not _as_stated(joint, n)] or held}
-    return svg(forest(joint, joint.datasets, shared), "forest", joint_caption(joint))
-
-
-def joint_caption(joint: StoredJoint) -> str:
-    return SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
+    caption = SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
+    return "forest", caption, forest(joint, joint.datasets, shared)
 
 
 def joint_table(joint: StoredJoint) -> str:
@@ -158,7 +155,7 @@ def forest(
     return in_columns(panels, (2.0 + 0.36 * min(count, 60)) * POINTS)
 
 
-def fits(joint: StoredJoint) -> Chart | None:
+def fits(joint: StoredJoint) -> list[Captioned]:
     """Observations and bands of the first data sets that have several; no panel where a set is one number."""
     fit, panels = joint.group("fit"), []
     followed = [name for name in joint.datasets if np.isfinite(fit["time"].sel(dataset=name).values).sum() > 1]
@@ -171,7 +168,8 @@ def fits(joint: StoredJoint) -> Chart | None:
         panel.line(times, middle, "posterior")
         panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
         panels.append(panel)
-    return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
+    caption = FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else "")
+    return [("fits", caption, in_columns(panels, 3.6 * POINTS, width=PAGE))] if panels else []
 
 
 def write_joint(folder: Path) -> Path:
@@ -186,13 +184,10 @@ def write_joint(folder: Path) -> Path:
     return write_page(
         folder,
         "joint",
+        [joint_figure(joint), *fits(joint)],
         joint=joint,
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
-        forest=joint_figure(joint),
-        caption=joint_caption(joint),
-        fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
-        fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
         sets=[*zip(joint.datasets, *fitted, strict=True)],
     )
 
@@ -348,14 +343,11 @@ def population_lines(stored: StoredPopulation) -> Iterator[str]:
     yield from sentences(stored)
 
 
-def population_figure(stored: StoredPopulation) -> str:
-    """All data sets over the population, as SVG."""
+def population_figure(stored: StoredPopulation) -> Captioned:
+    """All data sets over the population."""
     centres = {name: stored.group("posterior")[f"{name}_{stored.headline}"] for name in stored.names}
-    return svg(forest(stored, stored.datasets, centres, stored.reference), "forest", caption(stored))
-
-
-def caption(stored: StoredPopulation) -> str:
-    return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
+    caption = CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
+    return "forest", caption, forest(stored, stored.datasets, centres, stored.reference)
 
 
 def write_population(folder: Path) -> Path:
@@ -367,10 +359,9 @@ def write_population(folder: Path) -> Path:
     return write_page(
         folder,
         "population",
+        [population_figure(stored)],
         stored=stored,
         sentences=sentences(stored, stored.symbols),
         population=rows[: len(stored.words)],
         sets=rows[len(stored.words) :],
-        forest=population_figure(stored),
-        caption=caption(stored),
     )
