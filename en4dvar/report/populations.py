@@ -205,7 +205,7 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
 def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values) -> Centre:
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
-    attributes = s.tree.attrs
+    attributes = s.attributes
     return without_pull(
         s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
         float(attributes["effective_draws"]), seed, [*_known(s, values)], s.prior_of(name).log_std,
@@ -286,7 +286,7 @@ def _stored(folder: Path) -> StoredPopulation:
         )
     stored = load_population(path)
     with understood(path):
-        if "white" not in stored.tree.children:
+        if "/white" not in stored.groups:
             raise OutputError(f"{path}: written by an earlier version of en4dvar; make it again to compare it")
         for name in (*stored.names, *stored.common):
             _ = stored.white(name), stored.prior_of(name)

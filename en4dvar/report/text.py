@@ -18,8 +18,6 @@ from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.results.declared import zero_of
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from en4dvar.results.netcdf import Variable
 
 VALUES = ("prior_mean", "prior_std", "mean", "std", "q05", "q50", "q95", "centre")  # of a parameter, in its unit
@@ -189,18 +187,18 @@ def fixed(value: float, places: int) -> str:
     return f"{value:z.{places}f}" if math.isfinite(value) else "–"
 
 
-def shown(variable: Variable | xr.DataArray, values: npt.ArrayLike | None = None) -> Array:
+def shown(variable: Variable, values: npt.ArrayLike | None = None) -> Array:
     """The values of a variable of a result file in its display unit, or others that have its unit."""
     held = np.asarray(variable.values if values is None else values, dtype=float)
     return convert(held, str(variable.attrs["units"]), display_unit(variable))
 
 
-def display_unit(variable: Variable | xr.DataArray) -> str:
+def display_unit(variable: Variable) -> str:
     """The unit in which a variable of a result file is shown."""
     return str(variable.attrs.get("display_units", variable.attrs["units"]))
 
 
-def axis_label(variable: Variable | xr.DataArray, words: str = "") -> str:
+def axis_label(variable: Variable, words: str = "") -> str:
     """Words, or the symbol of a variable of a result file, and its display unit."""
     return with_unit(words or str(variable.attrs["symbol"]), display_unit(variable))
 
