@@ -25,11 +25,10 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.summary import ParameterSummary, brief, results_table
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
+from en4dvar.results.declared import MEMBER, Axis, Declared, Stored, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, results_of, unpacked
@@ -41,12 +40,10 @@ COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
 
 
 @dataclass(frozen=True)
-class StoredResult:
+class StoredResult(Stored):
     """The posterior ensemble of one data set with everything that led to it: a thin view of ``groups``. Values are SI;
     members are draws of one chain; a failed member is NaN and ``active`` is False there.
     """
-
-    groups: Groups
 
     @classmethod
     def from_analysis(cls, analysis: Analysis, attributes: Mapping[str, Any]) -> Self:
@@ -61,11 +58,6 @@ class StoredResult:
     def group(self, name: str) -> Group:
         """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it."""
         return joined(self.groups, f"/{name}")
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """Of the root."""
-        return self.groups["/"].attrs
 
     @property
     def name(self) -> str:
@@ -86,11 +78,6 @@ class StoredResult:
     def observable(self) -> str:
         """Name of the observed quantity; of several series that of the first."""
         return self.axes[0].name
-
-    @property
-    def cautions(self) -> tuple[Caution, ...]:
-        """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
-        return parsed(self.attributes["warnings"])
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ and of each one's own, the fits), ``population.nc`` (draws of mean, spread and t
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -22,8 +21,8 @@ from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.declared import Names, parameter_of, text
-from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, to_bytes, understood, variable
+from en4dvar.results.declared import Names, Stored, parameter_of, text
+from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, understood, variable
 
 JOINT, POPULATION = "joint.nc", "population.nc"
 GROUPS = "groups"  # the folder of a run directory that holds one folder a group, each with its POPULATION
@@ -158,36 +157,21 @@ def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
     }
 
 
-@dataclass(frozen=True)
-class StoredGroups:
-    """A file about several data sets together: a thin view of ``groups``."""
+class StoredGroups(Stored):
+    """A file about several data sets together."""
 
-    groups: Groups
     what: ClassVar[str]
     needed: ClassVar[tuple[str, ...]]  # groups
     read: ClassVar[tuple[str, ...]]  # what is looked at as the file is read
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """Of the root."""
-        return self.groups["/"].attrs
 
     @property
     def datasets(self) -> tuple[str, ...]:
         return tuple(map(str, self.group("alone")["dataset"].values))
 
     @property
-    def cautions(self) -> tuple[Caution, ...]:
-        """Warnings of the estimate, the worst first."""
-        return parsed(self.attributes["warnings"])
-
-    @property
     def doubts(self) -> tuple[Caution, ...]:
         """Warnings of what is to be quoted, the worst first."""
         return self.cautions
-
-    def group(self, name: str) -> Group:
-        return self.groups[f"/{name}"]
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -202,7 +186,6 @@ class StoredGroups:
         return stored
 
 
-@dataclass(frozen=True)
 class StoredJoint(StoredGroups):
     """A file of :func:`save_joint`: the groups ``needed`` and, without odd data sets, ``without``."""
 
@@ -340,7 +323,6 @@ def _sets(population: Population) -> dict[str, Variable]:
     }
 
 
-@dataclass(frozen=True)
 class StoredPopulation(StoredGroups):
     """A file of :func:`save_population`."""
 
