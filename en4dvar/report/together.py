@@ -191,8 +191,8 @@ def write_joint(folder: Path) -> Path:
         "joint",
         [joint_figure(joint), *fits(joint)],
         joint=joint,
-        shared=[e for e in rows if not e.dataset],
-        own=[e for e in rows if e.dataset],
+        shared=[("", e) for e in rows if not e.dataset],
+        own=[(e.dataset, e) for e in rows if e.dataset],
         sets=[*zip(joint.datasets, *fitted, strict=True)],
     )
 
@@ -359,7 +359,7 @@ def population_figure(stored: StoredPopulation) -> Captioned:
 def write_population(folder: Path) -> Path:
     """Write ``population.html``, ``.csv``, ``.tex`` from its file; returns the page. Raises :class:`OutputError`."""
     stored = StoredPopulation.load(folder / POPULATION)
-    rows = summaries(stored)
+    rows, count = summaries(stored), len(stored.words)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
     return write_page(
@@ -368,6 +368,6 @@ def write_population(folder: Path) -> Path:
         [population_figure(stored)],
         stored=stored,
         sentences=sentences(stored, stored.symbols),
-        population=rows[: len(stored.words)],
-        sets=rows[len(stored.words) :],
+        population=[(words, e) for words, of_it, _ in rows[:count] for e in of_it],
+        sets=[(name, e) for name, of_it, _ in rows[count:] for e in of_it],
     )
