@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import make_folder
-from en4dvar.report.chart import Chart, Mark, Panel, Row
+from en4dvar.report.chart import COLUMN, Chart, Mark, Panel, Row
 from en4dvar.report.paper import save_chart
 from en4dvar.report.text import pieces
 
@@ -77,8 +77,9 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
             parts += _panel(panel, row, top, x + left, width, f"{name}-{i}-{j}")
             x += left + width + GAP
         top += row.height
+    wide = ' class="wide"' if chart.width > COLUMN else ""
     head = (
-        f'<svg role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
+        f'<svg{wide} role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
         f'font-size="{SMALL:g}" color="var(--ink)" fill="currentColor" stroke-linejoin="round">'
     )
     return Markup(f"{head}{''.join(parts)}</svg>")

@@ -72,7 +72,7 @@ def test_files_and_the_answer(found):
     assert "the median (geometric mean) of the population" in page
     assert page.index("varies by") < page.index('id="forest"') < page.index("<h2>The population</h2>")
     assert "k_mean" not in page
-    assert '<figure id="forest">' in page  # one panel: not as wide as the page
+    assert '<figure id="forest"><div class="scroll"><svg role' in page  # one panel: not as wide as the page
     assert f"{stored.attributes['effective_draws']:.0f} effective draws" in page
     population, sets = page.split("Each data set, given all of them")
     assert "what the data told" in population

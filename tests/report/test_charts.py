@@ -10,7 +10,7 @@ import pytest
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, ticks
+from en4dvar.report.chart import PAGE, Chart, Panel, Row, in_columns, numbers, powers, stacked, ticks
 from en4dvar.report.figures import steps
 from en4dvar.report.page import SetSummary, render_overview
 from en4dvar.report.paper import on_paper, save_chart
@@ -240,3 +240,9 @@ def test_figures_of_one_name_are_each_cut_at_their_own_panel(analysis):
     page = render_overview(sets, headlines, pages={}, failures={}, figures=[])
     cut = re.findall(r'<clipPath id="([^"]*)"><rect x="[^"]*" y="[^"]*" width="[^"]*" height="([^"]*)"', page)
     assert len({name for name, _ in cut}) == len({height for _, height in cut}) == 2
+
+
+@pytest.mark.parametrize(("columns", "wide"), [(1, False), (2, True)])
+def test_only_a_figure_of_several_columns_is_as_wide_as_a_page(columns, wide):
+    """One panel on the page of a comparison had letters twice as high as the text."""
+    assert ('class="wide"' in svg(in_columns([Panel(), Panel()], 100.0, columns), "a", "about")) == wide

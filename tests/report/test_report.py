@@ -358,7 +358,7 @@ def test_half_of_the_data_sets_is_half_of_those_to_be_trusted(analysis):
     sets = [replace(one, rows={name: own}) for own in rows]
     html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert "half of the data sets: 1.50 to 2.50" in html
-    assert html.index("posteriors come with") < html.index('<figure class="wide" id="estimates"')
+    assert html.index("posteriors come with") < html.index('<figure id="estimates"')
 
 
 @pytest.mark.slow
