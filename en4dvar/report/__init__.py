@@ -51,8 +51,6 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     :class:`LackingError`: results of data sets cannot be read; the page of the others, ``rest``, names them.
     """
     run_dir = Path(run_dir)
-    if not run_dir.is_dir():
-        raise OutputError(f"{run_dir}: no such run directory")
     stored = RunResults(run_dir)
     sets, lines = [], []
     for path, result in stored:

@@ -11,10 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +34,7 @@ from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.declared import Names
 from en4dvar.results.netcdf import Group, read_groups, understood
-from en4dvar.results.series_file import CERTAIN, MEAN, estimates, series_file, series_group, uncertain
+from en4dvar.results.series_file import CERTAIN, FILES, MEAN, estimates, series_file, series_group, uncertain
 from en4dvar.series.problem import SeriesResult
 from en4dvar.series.twin import TwinResult
 
@@ -50,19 +49,16 @@ RANKS = (
 )
 
 
-def write_cycles_report(kind: Literal["sequence", "twin"], run_dir: Path, files: bool = False) -> Path:
+def write_cycles_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` of a sequence or a twin experiment from its result, with ``files`` also figures as PDF and
     PNG; returns the path of the page. Raises :class:`OutputError`.
     """
-    data = read_groups(run_dir / f"{kind}.nc")["/"]
+    file = series_file(run_dir) or run_dir / FILES[0]
+    kind, data = file.stem, read_groups(file)["/"]
     shown, figures = (_scored(data), twin_figures(data)) if kind == "twin" else (_ended(data), sequence_figures(data))
     shown |= {"attributes": data.attrs, "sizes": data.sizes, "copies": files}
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
     return write_text(run_dir / "report.html", render(f"{kind}.html.j2", figures=drawn, **shown))
-
-
-write_sequence_report = partial(write_cycles_report, "sequence")
-write_twin_report = partial(write_cycles_report, "twin")
 
 
 def span_of(time: Array) -> tuple[float, float] | None:

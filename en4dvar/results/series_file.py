@@ -16,7 +16,7 @@ from en4dvar.series.moments import SequentialState
 from en4dvar.series.problem import SeriesProblem, SeriesResult, normalised_innovations
 from en4dvar.series.twin import TwinResult
 
-FILES = ("twin.nc", "sequence.nc")
+FILES = ("sequence.nc", "twin.nc")
 CERTAIN = 1e-9  # of its size: the spread of what is known
 MEAN = "mean_after_burn_in"  # attribute of the scores
 STATE, OBSERVATION = "time state", "time observation"

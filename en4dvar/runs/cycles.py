@@ -80,6 +80,7 @@ class Cycles(RunKind[R]):
     units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)
     readers = ("report", "rerun", "compare", "export")
+    writer = "en4dvar.report.sequence:write_cycles_report"
     summary: ClassVar["staticmethod[[Any], str]"]
     config: Any
     on_cycle: Callable[[int], None] | None = None
@@ -142,7 +143,6 @@ class TwinKind(Cycles[TwinResult]):
     name = "twin"
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
-    writer = "en4dvar.report.sequence:write_twin_report"
     summary = staticmethod(twin_csv)
 
     @property
@@ -168,7 +168,6 @@ class SequenceKind(Cycles[SeriesResult]):
     name = "sequence"
     result = "sequence.nc"
     files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
-    writer = "en4dvar.report.sequence:write_sequence_report"
     summary = staticmethod(sequence_csv)
 
     @cached_property

@@ -410,7 +410,7 @@ def test_chi2_in_words(chi2, attention):
 
 
 def test_nothing_to_report_is_one_clear_error(tmp_path):
-    with pytest.raises(OutputError, match="no such run directory"):
+    with pytest.raises(OutputError, match="no such file or directory"):
         write_pages(tmp_path / "absent")
     with pytest.raises(OutputError, match=r"holds no posterior\.nc"):
         write_pages(tmp_path)
