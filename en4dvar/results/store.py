@@ -31,7 +31,7 @@ from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, Stored, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result, results_of, unpacked
+from en4dvar.results.pack import PACK, file_names, read_result, results_of, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
 from en4dvar.results.variables import BESIDE, COORDINATES, GROUPS, OPTIONAL, SCOPES
 
@@ -205,9 +205,9 @@ def load_stored(path: str | Path) -> StoredResult:
             words = f"what several data sets say together, not the result of one; its numbers are in {path.stem}.csv"
             raise OutputError(f"{path}: {words}, its draws are read by xarray.open_datatree")
         if "/posterior" in groups and "dataset" in groups["/posterior"]:
-            names = list(map(str, groups["/posterior"]["dataset"].values))
-            hint = f"such as {path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"
-            raise OutputError(f"{path}: a campaign of {len(names)} data sets; give the address of one of them, {hint}")
+            stems = list(file_names(map(str, groups["/posterior"]["dataset"].values)).values())
+            hint = f"such as {path.parent / PACK / stems[0]}, or open all of them with xarray.open_datatree"
+            raise OutputError(f"{path}: a campaign of {len(stems)} data sets; give the address of one, {hint}")
         for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
             raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)
