@@ -255,13 +255,17 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
     write_csv(out / "estimates.csv", [["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
     columns = [f.name for f in fields(ModelScore)]
     write_csv(out / "evidence.csv", [columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])
-    figures, title = [("posteriors", CAPTION, overlay(comparison))], " – ".join(comparison.runs)
+    figures = [("posteriors", CAPTION, overlay(comparison))] if comparison.parameters else []
+    title = " – ".join(comparison.runs)
     return write_page(out, "compare", figures, out, title=title, comparison=comparison)
 
 
 def overlay(comparison: Comparison) -> Chart:
-    """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run."""
-    names = comparison.parameters
+    """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run.
+    Raises :class:`OutputError`: there is none, only fields.
+    """
+    if not (names := comparison.parameters):
+        raise OutputError("no parameter was estimated, only fields; the evidence of the runs is compared")
     panels = [_panel([e for e in comparison.estimates if e.summary.name == name], comparison.runs) for name in names]
     panels[0].legend = True
     return in_columns(panels, (4.0 + 0.15 * len(comparison.runs)) * POINTS)
