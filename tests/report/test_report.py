@@ -477,6 +477,9 @@ def test_one_of_a_thing_is_not_called_several(analysis):
     page = render_overview(sets, pages={}, failures={"b": "no readings"}, headlines=(), figures=())
     for words in ("<h1>1 data set</h1>", "1 data set without a posterior", "No warnings in any of 1 posterior."):
         assert words in page
+    assert "The median of the data sets" in page
+    fields = render_overview([replace(sets[0], rows={})], pages={}, failures={}, figures=())
+    assert "The median of the data sets" not in fields  # which are of no parameter
 
 
 def test_the_mean_of_a_prior_about_zero_is_zero_and_no_rounding(analysis):
