@@ -1,9 +1,12 @@
 """Equality of analyses to the last bit."""
 
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
+
+from en4dvar.results.netcdf import Group
 
 
 def assert_same_bits(a: Any, b: Any) -> None:
@@ -24,3 +27,10 @@ def assert_same_bits(a: Any, b: Any) -> None:
             assert repr(left) == repr(right)  # numbers that are not known are NaN
         elif field.name not in ("problem", "observations", "observable"):
             assert left == right, field.name
+
+
+def assert_same_groups(a: Mapping[str, Group], b: Mapping[str, Group], path: str) -> None:
+    """The variables of one group of two result files agree exactly; NaN equals NaN."""
+    assert a[path].variables.keys() == b[path].variables.keys()
+    for name, variable in a[path].variables.items():
+        np.testing.assert_array_equal(variable.values, b[path][name].values, name)

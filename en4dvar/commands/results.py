@@ -149,7 +149,7 @@ def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, tru
 
         evidences = [sampled_evidences(run_dir, workers, trust, tell) for run_dir in run_dirs]
         comparison = side_by_side.with_evidences(comparison, evidences)
-    if len(comparison.estimates) <= MOST_ROWS:
+    if 0 < len(comparison.estimates) <= MOST_ROWS:
         echo(f"{side_by_side.estimates_table(comparison)}\n")
     echo(side_by_side.comparison_table(comparison))
     return partial(side_by_side.write_comparison, comparison)

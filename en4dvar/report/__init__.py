@@ -5,7 +5,7 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
@@ -20,7 +20,7 @@ from en4dvar.report.figures import PIECE_COLUMNS, stored_walks
 from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
 from en4dvar.report.page import Headline, SetSummary, overview_figures, render_overview, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
-from en4dvar.report.svg import draw, svg
+from en4dvar.report.svg import draw
 from en4dvar.report.text import upper_first
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.pack import PACK
@@ -51,48 +51,34 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     :class:`LackingError`: results of data sets cannot be read; the page of the others, ``rest``, names them.
     """
     run_dir = Path(run_dir)
-    if not run_dir.is_dir():
-        raise OutputError(f"{run_dir}: no such run directory")
     stored = RunResults(run_dir)
-    if stored.files == [stored.whole]:
-        result = load_stored(stored.whole)
-        _require_known(run_dir, datasets, [result.name])
-        write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
-        _write_tables(run_dir, [_lines(result)])
-        folder = inside(run_dir, "figures") if files else None
-        return write_text(run_dir / "report.html", render_set(result, folder=folder))
     sets, lines = [], []
     for path, result in stored:
         sets.append(SetSummary.of(result, path.name))
         lines.append(_lines(result))
     if not sets:
         stored.require()
-    _write_tables(run_dir, lines)
     stems = {s.name: s.stem for s in sets}
-    _require_known(run_dir, datasets, stems)
-    failures = failed_datasets(stored.whole) | stored.lacking
+    for name in datasets:
+        if name not in stems:
+            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
+    for (table, (columns, _)), parts in zip(TABLES.items(), zip(*lines, strict=True), strict=True):
+        if rows := [*chain(*parts)]:
+            write_csv(run_dir / table, [("dataset", *columns), *rows])
+    single = stored.files == [stored.whole]
+    failures = {} if single else failed_datasets(stored.whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
+    if single:
+        folder = inside(run_dir, "figures") if files else None
+        return write_text(run_dir / "report.html", render_set(result, folder=folder))
     page = _write_campaign(run_dir, sets, failures, {stems[name] for name in datasets}, workers, files)
     stored.require(page)
     return page
 
 
-def _require_known(run_dir: Path, names: Sequence[str], known: Collection[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, known)}")
-
-
 def _lines(result: StoredResult) -> list[list[Line]]:
     """Of each of :data:`TABLES`, the name of the data set first."""
     return [[(result.name, *line[: len(columns)]) for line in lines(result)] for columns, lines in TABLES.values()]
-
-
-def _write_tables(run_dir: Path, sets: Sequence[list[list[Line]]]) -> None:
-    """The :data:`TABLES` of the data sets, where there is something to write."""
-    for (name, (columns, _)), parts in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
-        if lines := [*chain(*parts)]:
-            write_csv(run_dir / name, [("dataset", *columns), *lines])
 
 
 def _write_campaign(
@@ -119,8 +105,8 @@ def _write_campaign(
     of_gel = {name for _, of in populations_of(run_dir).values() for name in of.names}
     figures = draw(overview_figures(sets, of_gel), folder=inside(run_dir, "figures") if files else None)
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    shown = {"pages": pages, "failures": failures, "figures": figures, "headlines": _headlines(run_dir)}
-    return write_text(run_dir / "report.html", render_overview(sets, **shown))
+    shown = {"pages": pages, "failures": failures, "figures": figures}
+    return write_text(run_dir / "report.html", render_overview(sets, _headlines(run_dir), **shown))
 
 
 def _headlines(run_dir: Path) -> list[Headline]:
@@ -130,22 +116,22 @@ def _headlines(run_dir: Path) -> list[Headline]:
     headlines: list[Headline] = []
     groups = populations.groups_compared(run_dir)
     if isinstance(groups, str):
-        headlines.append(("summary.csv", "All data sets", [groups], "", "", ()))
+        headlines.append(("summary.csv", "All data sets", [groups], [], ()))
     elif groups is not None:
         populations.write_tables(groups, run_dir)
-        drawn = svg(populations.figure(groups), "populations", groups.caption)
         told = [*populations.group_sentences(groups, groups.symbols)]
-        headlines.append(("differences.csv", "The differences", told, drawn, groups.caption, ()))
+        figures = [("populations", groups.caption, populations.figure(groups))]
+        headlines.append(("differences.csv", "The differences", told, figures, ()))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population of all data sets"
         told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of, of.symbols)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
-        headlines.append((address, words, told, together.population_figure(of), together.caption(of), of.cautions))
+        headlines.append((address, words, told, [together.population_figure(of)], of.cautions))
     if (run_dir / JOINT).exists():
         shared = load_joint(run_dir / JOINT)
         lines = [upper_first(line) for line in together.joint_lines(shared)]
-        figure, caption = together.joint_figure(shared), together.joint_caption(shared)
-        headlines.append(("joint.html", "All of them together", lines, figure, caption, shared.cautions))
+        figures = [together.joint_figure(shared)]
+        headlines.append(("joint.html", "All of them together", lines, figures, shared.cautions))
     return headlines
 
 

@@ -9,7 +9,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,9 +25,8 @@ from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, plain_number
-from en4dvar.results.declared import NAMES, Names
+from en4dvar.results.declared import Names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -130,10 +129,6 @@ class Verdict:
     @property
     def words(self) -> str:
         """What is wrong, in a sentence; "" where nothing is seen."""
-        return self.said()
-
-    def said(self, written: Names = NAMES) -> str:
-        """:attr:`words`, with the quantity as ``written``."""
         if not self.off:
             return ""
         if self.quantity == ERRORS:
@@ -149,7 +144,7 @@ class Verdict:
             too.append("intervals hold the truth too rarely")
         elif any(low > stated for (low, _), stated in shares):
             too.append("intervals hold the truth too often")
-        return f"{written[self.quantity]}: {' and '.join(too) or 'the shape of the posterior is off'}"
+        return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"
 
 
 @dataclass(frozen=True)
@@ -183,18 +178,14 @@ class Calibration:
     @property
     def remarks(self) -> list[str]:
         """What is to be known beside the table: what is off, what failed, what was doubted."""
-        return self.said()
-
-    def said(self, written: Names = NAMES) -> list[str]:
-        """:attr:`remarks`, with quantities as ``written``."""
-        told = [verdict.said(written) for verdict in self.verdicts if verdict.off]
+        told = [verdict.words for verdict in self.verdicts if verdict.off]
         if self.good and not told:
             told = [f"{len(self.good)} sets show no sign that the posterior is not calibrated"]
         for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
             count = sum(judged.failure == reason for judged in self.sets)
             told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
         told_of = {verdict.quantity for verdict in self.verdicts}
-        if self.good and (absent := [written[name] for name, _ in self.quantities if name not in told_of]):
+        if self.good and (absent := [name for name, _ in self.quantities if name not in told_of]):
             told.append(f"no ranks of {', '.join(absent)}: what made the readings has no such value")
         counts = Counter(code for judged in self.good for code in judged.cautions)
         of = f"of {len(self.good)} sets have the serious warning"
@@ -273,9 +264,11 @@ def curves(calibration: Calibration) -> Chart:
 def write_calibration(folder: Path) -> Path:
     """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
     calibration = load_calibration(folder)
-    figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
-    about = {"calibration": calibration, "head": HEAD, "level": LEVEL, "configuration": _configuration(folder)}
-    return write_page(folder, "calibration", figures=draw(figures), **about)
+    figures = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
+    quantities = tuple((calibration.written[name], unit) for name, unit in calibration.quantities)
+    written = replace(calibration, quantities=quantities)
+    about = {"calibration": written, "head": HEAD, "level": LEVEL, "configuration": _configuration(folder)}
+    return write_page(folder, "calibration", figures, **about)
 
 
 def load_calibration(folder: Path) -> Calibration:

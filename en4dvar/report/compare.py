@@ -30,7 +30,6 @@ from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
@@ -251,19 +250,22 @@ def estimates_table(comparison: Comparison) -> str:
 def write_comparison(comparison: Comparison, out: str | Path) -> Path:
     """Write ``compare.html``, ``posteriors.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
-    ((_, _, figure),) = draw([("posteriors", CAPTION, overlay(comparison))], folder=out)
     warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
     rows = ([e.run, e.dataset, *csv_cells(e.summary), warned[e.run, e.dataset]] for e in comparison.by_parameter)
     write_csv(out / "estimates.csv", [["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
     columns = [f.name for f in fields(ModelScore)]
     write_csv(out / "evidence.csv", [columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])
-    about = {"title": " – ".join(comparison.runs), "figure": figure, "caption": CAPTION, "comparison": comparison}
-    return write_page(out, "compare", **about)
+    figures = [("posteriors", CAPTION, overlay(comparison))] if comparison.parameters else []
+    title = " – ".join(comparison.runs)
+    return write_page(out, "compare", figures, out, title=title, comparison=comparison)
 
 
 def overlay(comparison: Comparison) -> Chart:
-    """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run."""
-    names = comparison.parameters
+    """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run.
+    Raises :class:`OutputError`: there is none, only fields.
+    """
+    if not (names := comparison.parameters):
+        raise OutputError("no parameter was estimated, only fields; the evidence of the runs is compared")
     panels = [_panel([e for e in comparison.estimates if e.summary.name == name], comparison.runs) for name in names]
     panels[0].legend = True
     return in_columns(panels, (4.0 + 0.15 * len(comparison.runs)) * POINTS)

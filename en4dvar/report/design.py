@@ -19,7 +19,6 @@ from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import write_page
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, pretty_unit, rough_number, unit_behind, with_unit
 from en4dvar.results.design_file import DECISION, FILE, DesignRow, Designs, load_designs
 
@@ -247,12 +246,12 @@ def write_design(folder: Path) -> Path:
     return write_page(
         folder,
         "design",
+        figures,
         designs=written,
         by=by,
         rows=[(settings_text(row), row, words(written, row), row in best) for row in rows],
         lab=[(settings_text(row), readings_text(designs, row), row, of) for row, of in zip(best, told, strict=True)],
         remarks=remarks(designs),
-        drawings=draw(figures),
     )
 
 

@@ -22,7 +22,7 @@ from en4dvar.plumbing.tables import csv_text
 from en4dvar.report.text import GREEK as LETTERS
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.results.run_results import RunResults
-from en4dvar.results.store import StoredResult, posterior_file
+from en4dvar.results.store import StoredResult
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
@@ -56,8 +56,6 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     if kind not in get_args(Kind):
         raise ConfigError(f"no kind of table is called {shown(kind)}{suggest(kind, get_args(Kind))}")
     stored = RunResults(Path(run_dir))
-    if stored.files == [stored.whole]:
-        posterior_file(run_dir)  # says what is missing
     results = (result for _, result in stored)  # one is in memory at a time
     rows = ((r.name, r.rows, r.cautions) for r in results)
     if kind == "members":

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +15,7 @@ from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import counted, percent
 from en4dvar.report import responses, text
 from en4dvar.report.chart import DARK, LIGHT
+from en4dvar.report.svg import Captioned, draw
 
 WRITERS = (  # what templates call
     text.display_unit, text.estimate, text.fixed, text.in_powers, text.number_like, percent, text.plain_number,
@@ -22,9 +24,14 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def write_page(folder: Path, name: str, **content: Any) -> Path:
-    """Write ``name.html`` from our template of that name. Raises :class:`OutputError`."""
-    return write_text(folder / f"{name}.html", render(f"{name}.html.j2", **content))
+def write_page(
+    folder: Path, name: str, figures: Iterable[Captioned], copies: Path | None = None, /, **content: Any
+) -> Path:
+    """Write ``name.html`` from our template of that name, with ``figures``, whose ``copies`` as PDF and PNG go into a
+    folder, if any. Raises :class:`OutputError`.
+    """
+    page = render(f"{name}.html.j2", figures=draw(figures, folder=copies), **content)
+    return write_text(folder / f"{name}.html", page)
 
 
 def render(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:

@@ -136,9 +136,8 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
 
 NAMED = 40  # data sets whose names fit below a figure
 LISTED = 2000  # data sets in the table: a browser shows as many at once
-Headline = tuple[str, str, Sequence[str], str, str, Sequence[Caution]]
-"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption,
-warnings."""
+Headline = tuple[str, str, Sequence[str], Sequence[Captioned], Sequence[Caution]]
+"""What data sets say together: the address of a page and words for it, lines of the answer, figures, warnings."""
 
 
 @dataclass(frozen=True)
@@ -176,13 +175,15 @@ class SetSummary:
         return ", ".join(codes(self.cautions))
 
 
-def render_overview(sets: Sequence[SetSummary], **shown: Any) -> str:
+def render_overview(sets: Sequence[SetSummary], headlines: Sequence[Headline] = (), **shown: Any) -> str:
     """The page as HTML. Also shown: ``pages``, stem of a data set → address of its page, for those that have one;
-    ``failures``, name of one without a posterior → reason; drawn ``figures``; ``headlines`` (:data:`Headline`).
+    ``failures``, name of one without a posterior → reason; drawn ``figures``.
     """
     worst = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     listed, parameters = [s for s in sets if id(s) in worst], [_parameter(name, sets) for name in _parameters(sets)]
-    return render("campaign.html.j2", sets=sets, listed=listed, parameters=parameters, tally=_tally(sets), **shown)
+    shown |= {"listed": listed, "parameters": parameters, "tally": _tally(sets)}
+    told = [(*told, draw(figures, f"together{i}-"), cautions) for i, (*told, figures, cautions) in enumerate(headlines)]
+    return render("campaign.html.j2", sets=sets, headlines=told, **shown)
 
 
 def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:

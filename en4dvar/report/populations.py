@@ -28,7 +28,6 @@ from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
 from en4dvar.results.declared import NAMES, Names
 from en4dvar.results.netcdf import understood
@@ -206,7 +205,7 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
 def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values) -> Centre:
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
-    attributes = s.tree.attrs
+    attributes = s.attributes
     return without_pull(
         s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
         float(attributes["effective_draws"]), seed, [*_known(s, values)], s.prior_of(name).log_std,
@@ -287,7 +286,7 @@ def _stored(folder: Path) -> StoredPopulation:
         )
     stored = load_population(path)
     with understood(path):
-        if "white" not in stored.tree.children:
+        if "/white" not in stored.groups:
             raise OutputError(f"{path}: written by an earlier version of en4dvar; make it again to compare it")
         for name in (*stored.names, *stored.common):
             _ = stored.white(name), stored.prior_of(name)
@@ -383,10 +382,10 @@ def figure(c: PopulationsCompared) -> Chart:
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     """Write ``compare.html``, ``populations.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
-    ((_, _, drawn),) = draw([("populations", c.caption, figure(c))], folder=out)
     write_tables(c, out)
     title, told = " – ".join(c.populations), tuple(sentences(c, c.symbols))
-    return write_page(out, "compare", title=title, populations=told, figure=drawn, caption=c.caption)
+    figures = [("populations", c.caption, figure(c))]
+    return write_page(out, "compare", figures, out, title=title, populations=told)
 
 
 def write_tables(c: PopulationsCompared, folder: Path) -> None:

@@ -11,10 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +34,7 @@ from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.declared import Names
 from en4dvar.results.netcdf import Group, read_groups, understood
-from en4dvar.results.series_file import MEAN, estimates, series_file, series_group
+from en4dvar.results.series_file import CERTAIN, FILES, MEAN, estimates, series_file, series_group, uncertain
 from en4dvar.series.problem import SeriesResult
 from en4dvar.series.twin import TwinResult
 
@@ -44,26 +43,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BINS = 10
-CERTAIN = 1e-9  # of its size: the spread of what is known
 RANKS = (
     "Rank histogram: where each observation fell among the forecast members, errors of the observations added. A "
     "reliable ensemble has flat bars, 95 % of them inside the band; a valley is too little spread, a hill too much."
 )
 
 
-def write_cycles_report(kind: Literal["sequence", "twin"], run_dir: Path, files: bool = False) -> Path:
+def write_cycles_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` of a sequence or a twin experiment from its result, with ``files`` also figures as PDF and
     PNG; returns the path of the page. Raises :class:`OutputError`.
     """
-    data = read_groups(run_dir / f"{kind}.nc")["/"]
+    file = series_file(run_dir) or run_dir / FILES[0]
+    kind, data = file.stem, read_groups(file)["/"]
     shown, figures = (_scored(data), twin_figures(data)) if kind == "twin" else (_ended(data), sequence_figures(data))
     shown |= {"attributes": data.attrs, "sizes": data.sizes, "copies": files}
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
     return write_text(run_dir / "report.html", render(f"{kind}.html.j2", figures=drawn, **shown))
-
-
-write_sequence_report = partial(write_cycles_report, "sequence")
-write_twin_report = partial(write_cycles_report, "twin")
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
@@ -98,11 +93,7 @@ def symbols(data: Group) -> list[str]:
 
 def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
     """Name, mean, std and the unit they are shown in of the variables that are uncertain at the end."""
-    last = (data[f"analysis_{what}"].values[-1].tolist() for what in ("mean", "std"))
-    for (name, unit, display), *numbers in zip(variables(data), *last, strict=True):
-        mean, std = (float(convert(number, unit, display)) for number in numbers)
-        if std > CERTAIN * abs(mean):
-            yield name, mean, std, display
+    return uncertain(variables(data), *(data[f"analysis_{what}"].values[-1] for what in ("mean", "std")))
 
 
 def cycles_table(file: Path, kind: Kind) -> str:
@@ -424,7 +415,7 @@ def errors(data: Group) -> Chart:
     burn_in, truth = int(data.attrs["burn_in"]), data["truth"].values
     error, std = data["analysis_mean"].values - truth, data["analysis_std"].values
     inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
-    varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(truth).max(axis=0))  # not what is held fixed
+    varied = np.flatnonzero(std.max(axis=0) > CERTAIN * np.abs(truth).max(axis=0))  # not what is held fixed
     chosen = np.unique([*varied[: FEW - 1], varied[-1]])  # the last is an estimated parameter, if there is one
     time, panels = data["time"].values[-LAST:], []
     for i in chosen:

@@ -6,7 +6,6 @@ to the extremes of each part and dots on the same spot are drawn once, so that 1
 """
 
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,9 +16,9 @@ from markupsafe import Markup, escape
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import make_folder
-from en4dvar.report.chart import Chart, Mark, Panel, Row
+from en4dvar.report.chart import COLUMN, Chart, Mark, Panel, Row
 from en4dvar.report.paper import save_chart
-from en4dvar.report.text import math_pieces
+from en4dvar.report.text import pieces
 
 GAP = 6.0  # between panels
 SPACE = 3.0  # between their numbers below
@@ -78,8 +77,9 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
             parts += _panel(panel, row, top, x + left, width, f"{name}-{i}-{j}")
             x += left + width + GAP
         top += row.height
+    wide = ' class="wide"' if chart.width > COLUMN else ""
     head = (
-        f'<svg role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
+        f'<svg{wide} role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
         f'font-size="{SMALL:g}" color="var(--ink)" fill="currentColor" stroke-linejoin="round">'
     )
     return Markup(f"{head}{''.join(parts)}</svg>")
@@ -177,7 +177,7 @@ def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str]
     parts, at, line = [], x, top
     for label in panel.entries():
         marks = [m for m in panel.marks if m.label == label]
-        length = 15 + EM * SMALL * sum(len(piece) for _, piece in _pieces(label))  # the text takes this, about
+        length = 15 + EM * SMALL * sum(len(piece) for _, piece in pieces(label))  # the text takes this, about
         if at > x and at + length > x + width:
             at, line = x, line + SMALL + 4
         sample = Frame(at, line + 2, 11, SMALL, (0, 1), (0, 1))
@@ -215,7 +215,7 @@ def written(
 def _spans(text: str, size: float) -> str:
     """Text with symbols: letters slanted, indices small and shifted."""
     parts, shift = [], 0.0
-    for mark, piece in _pieces(text):
+    for mark, piece in pieces(text):
         wanted = {"_": 0.22, "^": -0.4}.get(mark, 0.0) * size
         dy = f' dy="{wanted - shift:.2g}"' if wanted != shift else ""
         small = f' font-size="{0.72 * size:.3g}"' if mark in "_^" and mark else ""
@@ -224,15 +224,6 @@ def _spans(text: str, size: float) -> str:
         parts.append(f"<tspan{how}>{escape(piece)}</tspan>" if how else str(escape(piece)))
         shift = wanted
     return "".join(parts)
-
-
-def _pieces(text: str) -> Iterator[tuple[str, str]]:
-    """("", words), ("i", symbol), ("_", index) or ("^", exponent), in order."""
-    for i, part in enumerate(re.split(r"(?<!\\)\$", text)):
-        if i % 2:
-            yield from ((mark or "i", piece) for mark, piece in math_pieces(part))
-        elif part:
-            yield "", part.replace(r"\$", "$")
 
 
 def draw(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,8 +18,6 @@ from en4dvar.plumbing.units import convert, is_unit
 from en4dvar.results.declared import zero_of
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from en4dvar.results.netcdf import Variable
 
 VALUES = ("prior_mean", "prior_std", "mean", "std", "q05", "q50", "q95", "centre")  # of a parameter, in its unit
@@ -188,18 +187,18 @@ def fixed(value: float, places: int) -> str:
     return f"{value:z.{places}f}" if math.isfinite(value) else "–"
 
 
-def shown(variable: Variable | xr.DataArray, values: npt.ArrayLike | None = None) -> Array:
+def shown(variable: Variable, values: npt.ArrayLike | None = None) -> Array:
     """The values of a variable of a result file in its display unit, or others that have its unit."""
     held = np.asarray(variable.values if values is None else values, dtype=float)
     return convert(held, str(variable.attrs["units"]), display_unit(variable))
 
 
-def display_unit(variable: Variable | xr.DataArray) -> str:
+def display_unit(variable: Variable) -> str:
     """The unit in which a variable of a result file is shown."""
     return str(variable.attrs.get("display_units", variable.attrs["units"]))
 
 
-def axis_label(variable: Variable | xr.DataArray, words: str = "") -> str:
+def axis_label(variable: Variable, words: str = "") -> str:
     """Words, or the symbol of a variable of a result file, and its display unit."""
     return with_unit(words or str(variable.attrs["symbol"]), display_unit(variable))
 
@@ -227,11 +226,9 @@ def symbol_html(symbol: str) -> Markup:
     >>> str(symbol_html(r"$\mu$")), str(symbol_html(r"$R_{\mathrm{eq}}$")), str(symbol_html("<b>"))
     ('<i>μ</i>', '<i>R</i><sub>eq</sub>', '&lt;b&gt;')
     """
-    if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
-        return escape(symbol)
-    tags = {"_": "sub", "^": "sup", "": "i"}
-    pieces = ((tags[mark], piece) for mark, piece in math_pieces(symbol[1:-1]))
-    return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) for tag, piece in pieces)
+    tags = {"_": "sub", "^": "sup", "i": "i"}
+    parts = ((tags.get(mark), piece) for mark, piece in pieces(symbol))
+    return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) if tag else piece for tag, piece in parts)
 
 
 def with_symbols(words: str) -> Markup:
@@ -240,8 +237,7 @@ def with_symbols(words: str) -> Markup:
     >>> str(with_symbols(r"$\mu$ of a < b")), str(with_symbols(r"$G$ · $\alpha$^0.23"))
     ('<i>μ</i> of a &lt; b', '<i>G</i> · <i>α</i><sup>0.23</sup>')
     """
-    within = re.sub(r"\$\^(−?[\d.]+)", r"^{\1}$", words)
-    return Markup("").join(symbol_html(part) for part in re.split(r"(\$[^$]+\$)", within))
+    return symbol_html(re.sub(r"\$\^(−?[\d.]+)", r"^{\1}$", words))
 
 
 def without_folders(text: object) -> str:
@@ -253,14 +249,23 @@ def without_folders(text: object) -> str:
     return re.sub(r"(?<![^\s'\"])(?:[A-Za-z]:)?[\\/](?=[^\s\\/])(?:[^\\/\n'\",]+[\\/])+", "…/", str(text))
 
 
-def math_pieces(body: str) -> list[tuple[str, str]]:
-    r"""What stands between two dollar signs: ("", base), ("_", index) and ("^", exponent) in order.
+def pieces(text: str) -> Iterator[tuple[str, str]]:
+    r"""Text with symbols between dollar signs: ("", words), ("i", base), ("_", index) and ("^", exponent) in order.
 
-    >>> math_pieces(r"R_{\mathrm{eq}}")
-    [('', 'R'), ('_', 'eq')]
+    >>> list(pieces(r"at $R_{\mathrm{eq}}$ for 5 \$"))
+    [('', 'at '), ('i', 'R'), ('_', 'eq'), ('', ' for 5 $')]
     """
+    for i, part in enumerate(re.split(r"(?<!\\)\$([^$]+)\$", text)):
+        if i % 2:
+            yield from _of_math(part)
+        elif part:
+            yield "", part.replace(r"\$", "$")
+
+
+def _of_math(body: str) -> list[tuple[str, str]]:
+    """What stands between two dollar signs."""
     body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
     body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], f"{m[1]} "), body).rstrip()
-    pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
-    return [(mark, index.strip("{} ") or base.strip("{}")) for mark, index, base in pieces]
+    parts = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
+    return [(mark or "i", index.strip("{} ") or base.strip("{}")) for mark, index, base in parts]

@@ -3,11 +3,10 @@ population (the mean, how much the data sets vary, the next one, and each given 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
 from en4dvar.diagnosis.honesty.checks import MOVED
@@ -22,8 +21,9 @@ from en4dvar.report import text
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import write_page
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import Captioned
 from en4dvar.results.declared import NAMES, Names, parameter_of
+from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
 MOST_FITS = 12  # panels of the figure
@@ -61,14 +61,21 @@ def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
 
 def _rows(joint: StoredJoint, group: str, cautions: Sequence[Caution], without: str = "") -> Iterator[JointRow]:
     held = joint.group(group)
-    for name, values in held.data_vars.items():
-        for dataset in map(str, held["dataset"].values) if "dataset" in values.dims else ("",):
-            draws = values.sel(dataset=dataset) if dataset else values
+    for name, values in held.variables.items():
+        every = _of_each(values, held) if "dataset" in values.dims else {"": values}
+        for dataset, draws in every.items():
             if not np.isfinite(draws.values).any():
                 continue
-            row = _row(cautions, str(name), draws)
-            stated = not (dataset or row.untrusted) and _as_stated(joint, str(name))
+            row = _row(cautions, name, draws)
+            stated = not (dataset or row.untrusted) and _as_stated(joint, name)
             yield JointRow(**vars(row), dataset=dataset, without=without, stated=stated)
+
+
+def _of_each(values: Variable, held: Group) -> dict[str, Variable]:
+    """By data set, what a variable along data sets is of it."""
+    dims = values.dims[:-1]
+    every = zip(map(str, held["dataset"].values), np.moveaxis(values.values, -1, 0), strict=True)
+    return {dataset: replace(values, dims=dims, values=own) for dataset, own in every}
 
 
 def _as_stated(joint: StoredJoint, name: str) -> bool:
@@ -78,9 +85,7 @@ def _as_stated(joint: StoredJoint, name: str) -> bool:
     return bool(draws.std() > np.sqrt(1 - HARDLY_INFORMED) * std and abs(np.median(draws) - middle) < MOVED * std)
 
 
-def _row(
-    cautions: Sequence[Caution], name: str, draws: xr.DataArray, prior: xr.DataArray | None = None
-) -> ParameterSummary:
+def _row(cautions: Sequence[Caution], name: str, draws: Variable, prior: Variable | None = None) -> ParameterSummary:
     before, after = (NOTHING if draw is None else text.shown(draw).ravel() for draw in (prior, draws))
     centre, learned = float(np.median(draws.values)), float(draws.attrs.get("learned", np.nan))
     return ParameterSummary.of(parameter_of(name, draws.attrs), before, after, centre, learned, cautions)
@@ -101,15 +106,12 @@ def joint_lines(joint: StoredJoint) -> list[str]:
     return lines
 
 
-def joint_figure(joint: StoredJoint) -> str:
-    """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
+def joint_figure(joint: StoredJoint) -> Captioned:
+    """All data sets over what they share; without what the data leave as it was stated, where there is more."""
     held = [name for name in joint.shared if name in joint.rest]
     shared = {name: joint.rest[name] for name in [n for n in held if not _as_stated(joint, n)] or held}
-    return svg(forest(joint, joint.datasets, shared), "forest", joint_caption(joint))
-
-
-def joint_caption(joint: StoredJoint) -> str:
-    return SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
+    caption = SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
+    return "forest", caption, forest(joint, joint.datasets, shared)
 
 
 def joint_table(joint: StoredJoint) -> str:
@@ -122,7 +124,7 @@ def joint_table(joint: StoredJoint) -> str:
 
 
 def forest(
-    groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray],
+    groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, Variable],
     reference: Mapping[str, tuple[float, float]] | None = None,
 ) -> Chart:  # fmt: skip
     """Each data set alone, and the draws of what is ``common``, one panel each; of some a ``reference`` of others.
@@ -145,7 +147,7 @@ def forest(
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
-        if "dataset" in posterior.get(name, draws).dims:
+        if name in posterior and "dataset" in posterior[name].dims:
             low, middle, high = text.shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
             if not doubted:
                 panel.intervals(low[has], high[has], -has - 0.3, "posterior")
@@ -158,20 +160,21 @@ def forest(
     return in_columns(panels, (2.0 + 0.36 * min(count, 60)) * POINTS)
 
 
-def fits(joint: StoredJoint) -> Chart | None:
+def fits(joint: StoredJoint) -> list[Captioned]:
     """Observations and bands of the first data sets that have several; no panel where a set is one number."""
     fit, panels = joint.group("fit"), []
-    followed = [name for name in joint.datasets if np.isfinite(fit["time"].sel(dataset=name).values).sum() > 1]
-    for name in followed[:MOST_FITS]:
-        curve = fit.sel(dataset=name)
-        times, low, middle, high = curve["band"].values.T
-        label = text.with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
-        panel = Panel(text.with_unit("time", str(curve["time_unit"].item())), label, title=text.figure_text(name))
+    followed = [i for i, times in enumerate(fit["time"].values) if np.isfinite(times).sum() > 1]
+    for i in followed[:MOST_FITS]:
+        times, low, middle, high = fit["band"].values[i].T
+        observable, unit, time_unit = (str(fit[key].values[i]) for key in ("observable", "unit", "time_unit"))
+        label, title = text.with_unit(observable, unit), text.figure_text(joint.datasets[i])
+        panel = Panel(text.with_unit("time", time_unit), label, title=title)
         panel.band(times, low, high, "posterior", 0.25)
         panel.line(times, middle, "posterior")
-        panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
+        panel.dots(fit["time"].values[i], fit["value"].values[i], "ink", 1.8)
         panels.append(panel)
-    return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
+    caption = FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else "")
+    return [("fits", caption, in_columns(panels, 3.6 * POINTS, width=PAGE))] if panels else []
 
 
 def write_joint(folder: Path) -> Path:
@@ -186,13 +189,10 @@ def write_joint(folder: Path) -> Path:
     return write_page(
         folder,
         "joint",
+        [joint_figure(joint), *fits(joint)],
         joint=joint,
-        shared=[e for e in rows if not e.dataset],
-        own=[e for e in rows if e.dataset],
-        forest=joint_figure(joint),
-        caption=joint_caption(joint),
-        fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
-        fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
+        shared=[("", e) for e in rows if not e.dataset],
+        own=[(e.dataset, e) for e in rows if e.dataset],
         sets=[*zip(joint.datasets, *fitted, strict=True)],
     )
 
@@ -213,9 +213,10 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
         rows.append((words, tuple(of_it), stored.cautions))
     if group != "posterior":
         return rows
+    own = {name: _of_each(v, posterior) for name, v in posterior.variables.items() if "dataset" in v.dims}
     for dataset in stored.datasets:
-        of_set = (v.sel(dataset=dataset) for v in posterior.data_vars.values() if "dataset" in v.dims)
-        rows.append((dataset, tuple(_row(stored.cautions, str(v.name), v) for v in of_set), stored.cautions))
+        of_set = tuple(_row(stored.cautions, name, of[dataset]) for name, of in own.items())
+        rows.append((dataset, of_set, stored.cautions))
     return rows
 
 
@@ -258,11 +259,11 @@ class _Answer:
         if odd:
             sets = ", ".join(stored.datasets[i] for i in odd)
             yield f"Perhaps not of the population; these numbers count them only as far as they are: {sets}."
-        if "empirical" in stored.tree.children:
+        if "/empirical" in stored.groups:
             checked = [self._of_sets(centre) for centre in centres if not centre.untrusted]
             yield from (f"Check without a model of the population: {words}." for words in checked)
         yield from map(self._together, stored.combinations)
-        if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
+        if float(stored.attributes["effective_draws_without_hyperprior"]) < FEWEST:
             words = f"the data leave {stored.headline} or spread open, or lie in its tail"
             yield f"The result without the hyperprior of {stored.headline} and spread is not known: {words}."
         else:
@@ -273,7 +274,7 @@ class _Answer:
     def _centre(self, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary) -> str:
         """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread."""
         stored = self.stored
-        if centre.untrusted and "empirical" in stored.tree.children:
+        if centre.untrusted and "/empirical" in stored.groups:
             doubt = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)})"
             return f"{centre.label}: {self._of_sets(centre)}; {doubt}: see the warnings."
         spread = f"{_median(between)} ({_range(between)})"
@@ -294,7 +295,7 @@ class _Answer:
     def _compared(self, centre: ParameterSummary) -> str:
         posterior = self.stored.group("posterior")[f"{centre.name}_{self.stored.headline}"]
         value, std = map(float, text.shown(posterior, self.stored.reference[centre.name]))
-        source = str(self.stored.tree.attrs.get("reference_source", ""))
+        source = str(self.stored.attributes.get("reference_source", ""))
         stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
         below = float(np.mean(text.shown(posterior) < value))
         name, unit = self.names[centre.name], text.unit_behind(centre.unit)
@@ -302,7 +303,7 @@ class _Answer:
         side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
         return f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
-    def _in_parts(self, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
+    def _in_parts(self, mean: ParameterSummary, of: Variable, std: float) -> str:
         """What the interval is made of, where data sets have anything in common."""
         stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
         between, common = (text.quantity(part, std, mean.unit) for part in stds)
@@ -338,7 +339,7 @@ class _Answer:
         return f"The data determine {product}, to {percent(combination.std)}, better than {names}."
 
 
-def _logarithmic(draws: xr.DataArray) -> bool:
+def _logarithmic(draws: Variable) -> bool:
     return bool(draws.attrs["transform"] == "lognormal")
 
 
@@ -348,29 +349,25 @@ def population_lines(stored: StoredPopulation) -> Iterator[str]:
     yield from sentences(stored)
 
 
-def population_figure(stored: StoredPopulation) -> str:
-    """All data sets over the population, as SVG."""
+def population_figure(stored: StoredPopulation) -> Captioned:
+    """All data sets over the population."""
     centres = {name: stored.group("posterior")[f"{name}_{stored.headline}"] for name in stored.names}
-    return svg(forest(stored, stored.datasets, centres, stored.reference), "forest", caption(stored))
-
-
-def caption(stored: StoredPopulation) -> str:
-    return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
+    caption = CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
+    return "forest", caption, forest(stored, stored.datasets, centres, stored.reference)
 
 
 def write_population(folder: Path) -> Path:
     """Write ``population.html``, ``.csv``, ``.tex`` from its file; returns the page. Raises :class:`OutputError`."""
     stored = StoredPopulation.load(folder / POPULATION)
-    rows = summaries(stored)
+    rows, count = summaries(stored), len(stored.words)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
     return write_page(
         folder,
         "population",
+        [population_figure(stored)],
         stored=stored,
         sentences=sentences(stored, stored.symbols),
-        population=rows[: len(stored.words)],
-        sets=rows[len(stored.words) :],
-        forest=population_figure(stored),
-        caption=caption(stored),
+        population=[(words, e) for words, of_it, _ in rows[:count] for e in of_it],
+        sets=[(name, e) for name, of_it, _ in rows[count:] for e in of_it],
     )

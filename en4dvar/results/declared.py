@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Parameter, Shown
-from en4dvar.results.netcdf import Group, Variable, netcdf_attributes
+from en4dvar.plumbing.caution import Caution, parsed
+from en4dvar.results.netcdf import Group, Groups, Variable, netcdf_attributes
 
 MEMBER = "chain draw"
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
@@ -162,6 +163,27 @@ class Names(dict[str, str]):
 
 
 NAMES = Names()
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds: a thin view of its ``groups``."""
+
+    groups: Groups
+
+    def group(self, name: str) -> Group:
+        """A group of the file, e.g. ``"prior_predictive"``."""
+        return self.groups[f"/{name}"]
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """Of the root."""
+        return self.groups["/"].attrs
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Why not to trust it, or read it with care: code, severity, words, advice; the worst first."""
+        return parsed(self.attributes["warnings"])
 
 
 def zero_of(time: Variable) -> float:

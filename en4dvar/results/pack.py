@@ -327,7 +327,7 @@ _understanding = functools.partial(retold, _NONE, ValueError, "no packed groups:
 @functools.lru_cache(maxsize=64)
 def _layout(text: bytes) -> PackedLayout:
     def understood(part: list[Any]) -> list[Any]:
-        return [(name, tuple(dims), shape, fill, _whole(said), *rest) for name, dims, shape, fill, said, *rest in part]
+        return [(name, tuple(dims), shape, fill, dict(said), *rest) for name, dims, shape, fill, said, *rest in part]
 
     groups = [(path, understood(variables), understood(coords)) for path, variables, coords in json.loads(text)]
     sizes = {
@@ -349,10 +349,6 @@ def _layout(text: bytes) -> PackedLayout:
 
 def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray | np.generic) else v for k, v in attributes.items()}
-
-
-def _whole(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: np.array(v) if isinstance(v, list) else v for k, v in attributes.items()}
 
 
 def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
@@ -390,7 +386,7 @@ def _restored(every: Sequence[Content], lead: tuple[int, ...], wanted: Collectio
         whole = bytearray().join(content.numbers for content in every)
         numbers = np.frombuffer(whole, np.uint8).reshape(len(every), -1)
         return {
-            path: Group(variables(held), variables(coords), _whole(said))
+            path: Group(variables(held), variables(coords), dict(said))
             for (path, held, coords), said in zip(every[0].layout.groups, every[0].attributes, strict=True)
             if wanted is None or path in wanted
         }

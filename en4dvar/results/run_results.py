@@ -31,9 +31,9 @@ class LackingError(OutputError):
 
 
 class RunResults:
-    """The results of a run directory, by name; of a single data set ``posterior.nc``, which need not exist. ``files``:
-    where they are; ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as
-    they are read. Raises :class:`OutputError`: a run was killed as it replaced another, or is of another kind.
+    """The results of a run directory, by name; of a single data set ``posterior.nc``. ``files``: where they are;
+    ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as they are read.
+    Raises :class:`OutputError`: there are none, a run was killed as it replaced another, or is of another kind.
     """
 
     def __init__(self, run_dir: Path):
@@ -51,7 +51,7 @@ class RunResults:
             self.files = results_of(pack) if pack.exists() else []
             self._look_for(planned, known_pack(pack) if pack.exists() else Pack(pack))
         if not (self.files or self.lacking):
-            self.files = [self.whole]
+            self.files = [posterior_file(run_dir)]  # or says what is missing
 
     def _look_for(self, planned: list[str], pack: Pack) -> None:
         estimated = datasets_in(self.whole)
@@ -101,8 +101,6 @@ def result_files(run_dir: Path) -> list[Path]:
     """
     results = RunResults(run_dir)
     results.check()
-    if results.files == [results.whole]:
-        posterior_file(run_dir)  # says what is missing
     return results.files
 
 

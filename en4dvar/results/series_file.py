@@ -1,6 +1,6 @@
 """The result of a series: ``sequence.nc`` of data, ``twin.nc`` of a twin experiment, and their ``summary.csv``."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from en4dvar.series.moments import SequentialState
 from en4dvar.series.problem import SeriesProblem, SeriesResult
 from en4dvar.series.twin import TwinResult
 
-FILES = ("twin.nc", "sequence.nc")
+FILES = ("sequence.nc", "twin.nc")
+CERTAIN = 1e-9  # of its size: the spread of what is known
 MEAN = "mean_after_burn_in"  # attribute of the scores
 STATE, OBSERVATION = "time state", "time observation"
 
@@ -219,13 +220,18 @@ ATTRIBUTES = {"sequence.nc": (*SEQUENCE_ATTRIBUTES, *RUN_ATTRIBUTES), "twin.nc":
 
 def estimates(result: SeriesResult) -> list[tuple[str, float, float, str]]:
     """(name, mean, std, unit) of what is uncertain in the analysis at the last time, in display units."""
-    last, told = result.run.analysis, []
-    states = zip(_states(result), _states_shown(result), strict=True)
-    for ((name, unit), shown), mean, std in zip(states, last.mean[-1], last.std[-1], strict=True):
-        if std > 1e-12 * abs(mean):
-            value, spread = (float(convert(float(number), unit, shown.display_unit)) for number in (mean, std))
-            told.append((name, value, spread, shown.display_unit))
-    return told
+    displays = (shown.display_unit for shown in _states_shown(result))
+    states = ((*state, display) for state, display in zip(_states(result), displays, strict=True))
+    last = result.run.analysis
+    return list(uncertain(states, last.mean[-1], last.std[-1]))
+
+
+def uncertain(states: Iterable[Sequence[str]], mean: Array, std: Array) -> Iterator[tuple[str, float, float, str]]:
+    """Name, mean, std and the unit they are shown in of ``states`` (name, unit, that unit) that are not just known."""
+    for (name, unit, display), *numbers in zip(states, mean.tolist(), std.tolist(), strict=True):
+        value, spread = (float(convert(number, unit, display)) for number in numbers)
+        if spread > CERTAIN * abs(value):
+            yield name, value, spread, display
 
 
 def sequence_csv(result: SeriesResult) -> str:

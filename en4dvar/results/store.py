@@ -25,14 +25,13 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.summary import ParameterSummary, brief, results_table
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
+from en4dvar.results.declared import MEMBER, Axis, Declared, Stored, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.kinds import require_no_other
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result, results_of, unpacked
+from en4dvar.results.pack import PACK, file_names, read_result, results_of, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
 from en4dvar.results.variables import BESIDE, COORDINATES, GROUPS, OPTIONAL, SCOPES
 
@@ -41,12 +40,10 @@ COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
 
 
 @dataclass(frozen=True)
-class StoredResult:
+class StoredResult(Stored):
     """The posterior ensemble of one data set with everything that led to it: a thin view of ``groups``. Values are SI;
     members are draws of one chain; a failed member is NaN and ``active`` is False there.
     """
-
-    groups: Groups
 
     @classmethod
     def from_analysis(cls, analysis: Analysis, attributes: Mapping[str, Any]) -> Self:
@@ -61,11 +58,6 @@ class StoredResult:
     def group(self, name: str) -> Group:
         """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it."""
         return joined(self.groups, f"/{name}")
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """Of the root."""
-        return self.groups["/"].attrs
 
     @property
     def name(self) -> str:
@@ -86,11 +78,6 @@ class StoredResult:
     def observable(self) -> str:
         """Name of the observed quantity; of several series that of the first."""
         return self.axes[0].name
-
-    @property
-    def cautions(self) -> tuple[Caution, ...]:
-        """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
-        return parsed(self.attributes["warnings"])
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -218,9 +205,9 @@ def load_stored(path: str | Path) -> StoredResult:
             words = f"what several data sets say together, not the result of one; its numbers are in {path.stem}.csv"
             raise OutputError(f"{path}: {words}, its draws are read by xarray.open_datatree")
         if "/posterior" in groups and "dataset" in groups["/posterior"]:
-            names = list(map(str, groups["/posterior"]["dataset"].values))
-            hint = f"such as {path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"
-            raise OutputError(f"{path}: a campaign of {len(names)} data sets; give the address of one of them, {hint}")
+            stems = list(file_names(map(str, groups["/posterior"]["dataset"].values)).values())
+            hint = f"such as {path.parent / PACK / stems[0]}, or open all of them with xarray.open_datatree"
+            raise OutputError(f"{path}: a campaign of {len(stems)} data sets; give the address of one, {hint}")
         for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
             raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)

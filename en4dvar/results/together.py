@@ -2,13 +2,10 @@
 and of each one's own, the fits), ``population.nc`` (draws of mean, spread and the next one, those of each given all).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -24,11 +21,8 @@ from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.declared import Names, parameter_of, text
-from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, tree_of, understood, variable
-
-if TYPE_CHECKING:
-    import xarray as xr
+from en4dvar.results.declared import Names, Stored, parameter_of, text
+from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, understood, variable
 
 JOINT, POPULATION = "joint.nc", "population.nc"
 GROUPS = "groups"  # the folder of a run directory that holds one folder a group, each with its POPULATION
@@ -163,11 +157,9 @@ def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
     }
 
 
-@dataclass(frozen=True)
-class StoredGroups:
-    """A file about several data sets together: a thin view of ``tree``."""
+class StoredGroups(Stored):
+    """A file about several data sets together."""
 
-    tree: xr.DataTree
     what: ClassVar[str]
     needed: ClassVar[tuple[str, ...]]  # groups
     read: ClassVar[tuple[str, ...]]  # what is looked at as the file is read
@@ -177,17 +169,9 @@ class StoredGroups:
         return tuple(map(str, self.group("alone")["dataset"].values))
 
     @property
-    def cautions(self) -> tuple[Caution, ...]:
-        """Warnings of the estimate, the worst first."""
-        return parsed(self.tree.attrs["warnings"])
-
-    @property
     def doubts(self) -> tuple[Caution, ...]:
         """Warnings of what is to be quoted, the worst first."""
         return self.cautions
-
-    def group(self, name: str) -> xr.Dataset:
-        return self.tree.children[name].to_dataset()
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -196,13 +180,12 @@ class StoredGroups:
         if {f"/{group}" for group in cls.needed} - set(held):
             raise OutputError(f"{path}: not {cls.what}")
         with understood(path):
-            stored = cls(tree_of(held))
+            stored = cls(held)
             for key in ("datasets", "cautions", *cls.read):
                 getattr(stored, key)
         return stored
 
 
-@dataclass(frozen=True)
 class StoredJoint(StoredGroups):
     """A file of :func:`save_joint`: the groups ``needed`` and, without odd data sets, ``without``."""
 
@@ -213,7 +196,7 @@ class StoredJoint(StoredGroups):
     @property
     def shared(self) -> tuple[str, ...]:
         """Names of the variables of what is shared."""
-        return tuple(str(name) for name in self.group("prior").data_vars)
+        return tuple(self.group("prior").variables)
 
     @property
     def odd(self) -> tuple[str, ...]:
@@ -223,7 +206,7 @@ class StoredJoint(StoredGroups):
         return tuple(name for name, is_odd in zip(self.datasets, odd, strict=True) if is_odd)
 
     @property
-    def rest(self) -> xr.Dataset:
+    def rest(self) -> Group:
         """The posterior, without the odd data sets where there are any."""
         return self.group("without" if self.odd else "posterior")
 
@@ -340,7 +323,6 @@ def _sets(population: Population) -> dict[str, Variable]:
     }
 
 
-@dataclass(frozen=True)
 class StoredPopulation(StoredGroups):
     """A file of :func:`save_population`."""
 
@@ -350,13 +332,13 @@ class StoredPopulation(StoredGroups):
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(str(self.tree.attrs["parameters"]).split())
+        return tuple(str(self.attributes["parameters"]).split())
 
     @property
     def symbols(self) -> Names:
         """Parameter or common quantity → how it is written in a figure."""
-        variables = self.group("posterior").data_vars.items()
-        return Names((str(name), str(values.attrs["symbol"])) for name, values in variables)
+        variables = self.group("posterior").variables.items()
+        return Names((name, str(values.attrs["symbol"])) for name, values in variables)
 
     @property
     def headline(self) -> str:
@@ -379,13 +361,13 @@ class StoredPopulation(StoredGroups):
         return self._values("known")
 
     def _values(self, attribute: str) -> dict[str, tuple[float, float]]:
-        lines = (line.split() for line in str(self.tree.attrs.get(attribute, "")).splitlines())
+        lines = (line.split() for line in str(self.attributes.get(attribute, "")).splitlines())
         return {name: (float(value), float(std)) for name, value, std in lines}
 
     @property
     def common(self) -> tuple[str, ...]:
         """Quantities that have one value in all data sets."""
-        return tuple(str(self.tree.attrs.get("common", "")).split())
+        return tuple(str(self.attributes.get("common", "")).split())
 
     @property
     def belongs(self) -> dict[str, float]:
@@ -396,7 +378,7 @@ class StoredPopulation(StoredGroups):
     @property
     def odd_before(self) -> Array:
         """(S,) probabilities that data sets are not of the population, before their data are seen."""
-        usual = np.full(len(self.datasets), float(self.tree.attrs.get("hyperprior_odd", 0)))
+        usual = np.full(len(self.datasets), float(self.attributes.get("hyperprior_odd", 0)))
         alone = self.group("alone")
         return np.asarray(alone["odd_before"].values, dtype=float) if "odd_before" in alone else usual
 
@@ -426,7 +408,7 @@ class StoredPopulation(StoredGroups):
     def combinations(self) -> tuple[Combination, ...]:
         """What the data determine together and not one by one."""
         combinations = []
-        for line in str(self.tree.attrs["combinations"]).splitlines():
+        for line in str(self.attributes["combinations"]).splitlines():
             std, *rest = line.split()
             parts = tuple((name, float(a)) for name, a in zip(rest[::2], rest[1::2], strict=True))
             combinations.append(Combination(parts, float(std)))
@@ -440,7 +422,7 @@ def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
     """Group of data sets → the folder of its population, and this, as configured. Raises :class:`OutputError`."""
     folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{POPULATION}")), key=natural)
     stored = [(folder, load_population(folder / POPULATION)) for folder in folders]
-    return {str(of.tree.attrs.get("group", folder.name)): (folder, of) for folder, of in stored}
+    return {str(of.attributes.get("group", folder.name)): (folder, of) for folder, of in stored}
 
 
 def populations_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:

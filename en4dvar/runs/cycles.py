@@ -78,6 +78,7 @@ class Cycles(RunKind[R]):
     units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)
     readers = ("report", "rerun", "compare", "export")
+    writer = "en4dvar.report.sequence:write_cycles_report"
     summary: ClassVar["staticmethod[[Any], str]"]
     config: Any
     on_cycle: Callable[[int], None] | None = None
@@ -139,7 +140,6 @@ class TwinKind(Cycles[TwinOutcome]):
     name = "twin"
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
-    writer = "en4dvar.report.sequence:write_twin_report"
     summary = staticmethod(twin_csv)
 
     @property
@@ -166,7 +166,6 @@ class SequenceKind(Cycles[SequenceOutcome]):
     name = "sequence"
     result = "sequence.nc"
     files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
-    writer = "en4dvar.report.sequence:write_sequence_report"
     summary = staticmethod(sequence_csv)
 
     @cached_property

@@ -108,20 +108,20 @@ def test_a_page_without_them_is_silent(run_dir, tmp_path):
 
 
 def test_a_campaign_keeps_them(run_dir, tmp_path):
-    for name in ("a", "b"):
+    for name in ("a_1", "b"):
         add_to_pack(tmp_path, name, load_result(run_dir / "posterior.nc"))
-    path = save_campaign(tmp_path / "posterior.nc", Pack(tmp_path / PACK), {"a": "a", "b": "b"}, {}, {})
+    path = save_campaign(tmp_path / "posterior.nc", Pack(tmp_path / PACK), {"a 1": "a_1", "b": "b"}, {}, {})
     with netCDF4.Dataset(path) as file:
         stats = file["sample_stats"]
         assert stats["what_if_change"].dimensions == ("dataset", "alternative", "parameter")
         assert list(stats["alternative"][:]) == ["clock", "scale", "other"]
         np.testing.assert_allclose(np.sum(stats["ledger_weight"][:], axis=-1), 1.0)
     for place in (tmp_path, path):
-        with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a, or"):
+        with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a_1, or"):
             load_result(place)
-    with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a$"):
+    with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a_1$"):
         load_result(tmp_path / PACK)
-    assert load_result(tmp_path / PACK / "a").parameters
+    assert load_result(tmp_path / PACK / "a_1").parameters
 
 
 def test_every_variable_is_documented(run_dir):

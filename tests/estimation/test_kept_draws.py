@@ -57,7 +57,7 @@ def test_a_run_samples_no_data_set_twice(tmp_path):
     run = run_campaign(tmp_path / "wells.yaml").directory
     _, sets = finished([run], True, None)
     assert all(s.drawn is not None for s in sets)
-    assert load_population(run / "population.nc").tree.attrs["forward_runs"] == 0
+    assert load_population(run / "population.nc").attributes["forward_runs"] == 0
 
 
 BEND = np.array([0.6, -0.5, 0.4, 0.3])

@@ -10,9 +10,11 @@ import pytest
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, ticks
+from en4dvar.report.chart import PAGE, Chart, Panel, Row, in_columns, numbers, powers, stacked, ticks
 from en4dvar.report.figures import steps
+from en4dvar.report.page import SetSummary, render_overview
 from en4dvar.report.paper import on_paper, save_chart
+from en4dvar.report.result import Result
 from en4dvar.report.svg import SHOWN, svg
 
 
@@ -227,3 +229,20 @@ def test_paper_shows_the_same():
     assert ax.lines[0].get_xydata().tolist() == [[0, 4], [1, 4], [1, 8], [3, 8]]
     assert ax.lines[0].get_linewidth() == 2.0
     assert [text.get_text() for text in empty.texts] == ["+0.5"]
+
+
+def test_figures_of_one_name_are_each_cut_at_their_own_panel(analysis):
+    """Of two groups the second figure was cut at the first one's frame: data sets of the larger group were not seen."""
+    sets = [SetSummary.of(Result.from_analysis(analysis, {}), "a")]
+    panels = [Panel(ylim=(-count, 1.0)) for count in (3.0, 8.0)]
+    of_groups = [[("forest", "", Chart([Row(-20 * panel.ylim[0], [panel])]))] for panel in panels]
+    headlines = [(f"{i}/population.html", "", [], figures, ()) for i, figures in enumerate(of_groups)]
+    page = render_overview(sets, headlines, pages={}, failures={}, figures=[])
+    cut = re.findall(r'<clipPath id="([^"]*)"><rect x="[^"]*" y="[^"]*" width="[^"]*" height="([^"]*)"', page)
+    assert len({name for name, _ in cut}) == len({height for _, height in cut}) == 2
+
+
+@pytest.mark.parametrize(("columns", "wide"), [(1, False), (2, True)])
+def test_only_a_figure_of_several_columns_is_as_wide_as_a_page(columns, wide):
+    """One panel on the page of a comparison had letters twice as high as the text."""
+    assert ('class="wide"' in svg(in_columns([Panel(), Panel()], 100.0, columns), "a", "about")) == wide

@@ -188,3 +188,13 @@ def test_the_warnings_for_which_a_verdict_is_doubted_are_listed_with_commas(tmp_
     comparison = compare_runs([run_dir(tmp_path / "one", ("a",)), run_dir(tmp_path / "two", ("a", "b"))])
     doubted = tuple(replace(score, doubted="non-gaussian at-bound") for score in comparison.scores)
     assert "one (non-gaussian, at-bound)" in replace(comparison, scores=doubted).verdict("set1")
+
+
+def test_runs_of_fields_alone_are_compared_by_their_evidence(tmp_path):
+    """Two priors of a field: the command ended with a traceback, for there is no panel."""
+    scores = tuple(ModelScore(run, "heads", e, np.nan, np.nan, 1.0, 9.0, 0.9) for run, e in (("a", 1.0), ("b", 4.0)))
+    page = write_comparison(Comparison(tuple(ranked(scores))), tmp_path).read_text(encoding="utf-8")
+    assert "b is preferred" in page
+    assert "<h2>Posteriors" not in page
+    with pytest.raises(OutputError, match="no parameter was estimated, only fields"):
+        Comparison(scores).plot()

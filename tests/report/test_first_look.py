@@ -17,6 +17,7 @@ from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.report.figures import histograms, neighbours
 from en4dvar.report.history import history
+from en4dvar.report.html import _environment
 from en4dvar.report.page import judge_chi2, render_set, trust
 from en4dvar.report.result import Result
 from en4dvar.results.scalars import SAMPLE_STATS
@@ -199,3 +200,12 @@ def test_a_fit_of_as_many_numbers_as_readings_tells_nothing_of_the_noise(chi2):
         False,
     )
     assert judge_chi2(30.0, 1, 0.999999)[1]
+
+
+def test_a_box_of_notes_alone_is_called_notes():
+    """On the pages of a joint estimate and of a population they stood as warnings, in orange."""
+    told = _environment("en4dvar.report").get_template("cautions.html.j2").module.told
+    note, grave = caution("down-weighted", "one reading counts less"), caution("misfit", "too large")
+    assert '<div class="warnings notes" role="note"><strong>Notes</strong>' in told([note])
+    assert '<div class="warnings" role="note"><strong>All: warnings</strong>' in told([grave, note], "All: ")
+    assert not told([]).strip()

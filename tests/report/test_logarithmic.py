@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from en4dvar.report import figures, responses
 from en4dvar.report.together import forest
+from en4dvar.results.netcdf import Group, Variable
 
 ABOUT = {"units": "1", "display_units": "1", "symbol": "x"}
 
@@ -17,9 +17,9 @@ ABOUT = {"units": "1", "display_units": "1", "symbol": "x"}
 @pytest.mark.parametrize(("lowest", "logarithmic"), [(0.2, True), (-0.2, False)])
 def test_an_interval_that_reaches_below_zero_is_drawn(lowest, logarithmic):
     """Of data sets that differ by a factor of 160 it was on a logarithmic axis, and had no width."""
-    alone = xr.Dataset({"x": (("dataset", "quantile"), np.array([[0.01, 0.1, 0.3], [0.5, 1.0, 1.6]]), ABOUT)})
-    groups = SimpleNamespace(group=lambda name: alone if name == "alone" else xr.Dataset(), doubts=())
-    draws = xr.DataArray(np.linspace(lowest, 1.0, 100)[None], dims=("chain", "draw"), attrs=ABOUT)
+    alone = Variable(("dataset", "quantile"), np.array([[0.01, 0.1, 0.3], [0.5, 1.0, 1.6]]), ABOUT)
+    groups = SimpleNamespace(group=lambda name: Group({"x": alone} if name == "alone" else {}), doubts=())
+    draws = Variable(("chain", "draw"), np.linspace(lowest, 1.0, 100)[None], ABOUT)
     ((panel,),) = (row.panels for row in forest(groups, ("a", "b"), {"x": draws}).rows)
     assert panel.x_logarithmic == logarithmic
     assert panel.limits()[0][0] < panel.marks[0].x[0]

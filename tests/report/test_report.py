@@ -358,7 +358,7 @@ def test_half_of_the_data_sets_is_half_of_those_to_be_trusted(analysis):
     sets = [replace(one, rows={name: own}) for own in rows]
     html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert "half of the data sets: 1.50 to 2.50" in html
-    assert html.index("posteriors come with") < html.index('<figure class="wide" id="estimates"')
+    assert html.index("posteriors come with") < html.index('<figure id="estimates"')
 
 
 @pytest.mark.slow
@@ -410,9 +410,9 @@ def test_chi2_in_words(chi2, attention):
 
 
 def test_nothing_to_report_is_one_clear_error(tmp_path):
-    with pytest.raises(OutputError, match="no such run directory"):
+    with pytest.raises(OutputError, match="no such file or directory"):
         write_pages(tmp_path / "absent")
-    with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
+    with pytest.raises(OutputError, match=r"holds no posterior\.nc"):
         write_pages(tmp_path)
 
 
@@ -477,6 +477,9 @@ def test_one_of_a_thing_is_not_called_several(analysis):
     page = render_overview(sets, pages={}, failures={"b": "no readings"}, headlines=(), figures=())
     for words in ("<h1>1 data set</h1>", "1 data set without a posterior", "No warnings in any of 1 posterior."):
         assert words in page
+    assert "The median of the data sets" in page
+    fields = render_overview([replace(sets[0], rows={})], pages={}, failures={}, figures=())
+    assert "The median of the data sets" not in fields  # which are of no parameter
 
 
 def test_the_mean_of_a_prior_about_zero_is_zero_and_no_rounding(analysis):

@@ -35,7 +35,6 @@ NAN = float("nan")
             [r"$G$ · $\alpha$^0.23, $R_0$^−0.5 < R"],
             ["<i>G</i> · <i>α</i><sup>0.23</sup>, <i>R</i><sub>0</sub><sup>−0.5</sup> &lt; R"],
         ),
-        (text.math_pieces, [r"R_{\mathrm{eq}}"], [[("", "R"), ("_", "eq")]]),
         (is_math, [r"$\mu_{max}$", r"$\frac{1}{2}R^2$", r"$\input{x}$", "$a}b{c$"], [True, True, False, False]),
         (latex_unit, ["um", "Pa s", "m s-1", "%", "1"], [r"$\mu$m", r"Pa\,s", r"m\,s$^{-1}$", r"\%", ""]),
         (ramp, [(GREYS, 0.0), (GREYS, 1.0)], ["#ffffff", "#000000"]),
@@ -75,6 +74,7 @@ def test_no_minus_stands_before_a_rounded_zero():
         (r"$\dot R^2$", "<i>dot R</i><sup>2</sup>"),
         (r"$\ln u$", "<i>ln u</i>"),
         (r"$t/t_{\max} + 1$", "<i>t/t</i><sub>max</sub><i> + 1</i>"),
+        (r"$G$ and $\mu$ for 5 $", "<i>G</i> and <i>μ</i> for 5 $"),
     ],
 )
 def test_symbols_as_html(symbol, html):
