@@ -162,7 +162,9 @@ def read_series(
         kept = kept[values[kept] > 0]
         codes = (values <= 0) & ((values < 0) | (np.arange(len(values)) >= first)) & ~np.isnan(times)
         left_out |= {BELOW: tuple(np.sort(times[codes]))} if codes.any() else {}
-    _check(times[kept], values[kept], value.name, path, fewest, zero)
+    for column in asked[: 1 + isinstance(time, Column)]:
+        _require_finite(columns[column.name], column.name, kept, lines, path)
+    _check(values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {c.name: _stds(c, converted[c], columns[c.name], kept, len(values), path) for c in errors}
@@ -241,13 +243,19 @@ def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, 
     return stds
 
 
-def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
+def _require_finite(column: Array, name: str, kept: Rows, lines: Sequence[int], path: Path) -> None:
+    """Raise :class:`DataError` where a number of the ``kept`` rows of a column is infinite."""
+    if len(wrong := kept[np.isinf(column[kept])]):
+        where = f":{lines[wrong[0]]}" if lines else f": sample {wrong[0] + 1}"
+        told = f"{column[wrong[0]]:g} in column {name!r}"
+        raise DataError(f"{path}{where}: {told}; correct it, or leave it blank (NaN) if the reading is missing")
+
+
+def _check(values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
         none = "blank" if zero else "blank, or not above zero"
         raise DataError(f"{path}: {name!r} holds no usable value (all NaN, or {none})")
-    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
-        raise DataError(f"{path}: infinite values")
     if len(values) < fewest:
         raise DataError(f"{path}: {len(values)} usable observations; at least {fewest} are needed")
 
