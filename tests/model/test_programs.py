@@ -120,6 +120,10 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "output: 11 values for 12 times; name the column of times" in failure(
         folder, "short", outputs={"y": {"column": "y"}}
     )
+    twice = {"y": {"file": "stdout", "pattern": r"(\S+)"}}
+    assert "times; the pattern is to match once for each value" in failure(folder, outputs=twice)
+    assert "output: times must increase, but the one of value 13 does not: nan follows 3" in failure(folder, "footer")
+    assert "'1,5' is no number; let the program write decimal points" in failure(folder, "comma")
     assert "times from 0 to 2.72727, but 0 to 3 are needed" in failure(folder, "short")
     assert "no column 'z'; the columns are: t, y" in failure(folder, outputs={"y": {"column": "z"}})
     missing = {"y": {"file": "out.json", "key": "run.z"}}
@@ -127,9 +131,11 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "not JSON" in failure(folder, outputs={"y": {"key": "run"}})
 
 
-@pytest.mark.parametrize(("what", "way"), [*(("fortran", way) for way in OUTPUTS), ("bare", "number of a column")])
+@pytest.mark.parametrize(
+    ("what", "way"), [*(("fortran", way) for way in OUTPUTS), ("bare", "number of a column"), ("marked", "column")]
+)
 def test_exponents_may_be_those_of_fortran(what, way, folder):
-    """1.03D+00; a table may have no header."""
+    """1.03D+00; a table may have no header, and begin with a mark of byte order."""
     (path,) = model_of(folder, what, outputs={"y": OUTPUTS[way]}).trajectories(np.array([[1.0, 0.5]]), TIMES)
     np.testing.assert_array_equal(path["y"], curve({"a": 1.0, "b": 0.5}, TIMES.tolist()))
 
@@ -213,6 +219,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "parameters": ({"parameters": {}}, "model.parameters: give at least 1"),
     "name": ({"parameters": {"a b": "1"}}, "model.parameters: 'a b' cannot be the name of a parameter"),
     "unit": ({"parameters": {"a": "metre per", "b": "1"}}, "model.parameters.a: unknown unit 'metre'"),
+    "unit 1": ({"parameters": {"a": 1, "b": "1"}}, "model.parameters.a: expected text; put it in quotes, not 1"),
     "bounds": (
         {"parameters": {"a": {"lower": 2, "upper": 1}, "b": "1"}},
         "model.parameters.a: lower (2) must lie below",

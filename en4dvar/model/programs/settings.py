@@ -173,7 +173,7 @@ class OutputOf(_Section):
 
 
 def _with_unit(text: Any) -> Any:
-    return {"unit": text} if isinstance(text, str) else text
+    return {"unit": text} if isinstance(text, str | int | float) else text
 
 
 UnitOrSection = Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]
