@@ -216,6 +216,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         "model: command: {aa} is not something that can be filled in",
     ),
     "no input": ({"templates": []}, "model: command: {input} is the first of templates, and there is none"),
+    "a file left behind": (
+        {"command": "cat tail.dat > {output}", "shell": True, "templates": []},
+        "model: command: tail.dat is not in the scratch directory that each run has; write {here}/tail.dat, or name it",
+    ),
     "parameters": ({"parameters": {}}, "model.parameters: give at least 1"),
     "name": ({"parameters": {"a b": "1"}}, "model.parameters: 'a b' cannot be the name of a parameter"),
     "unit": ({"parameters": {"a": "metre per", "b": "1"}}, "model.parameters.a: unknown unit 'metre'"),
@@ -264,6 +268,7 @@ def test_each_wrong_value_is_one_located_message(fault, folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "in.json.tpl").write_text("{}")
     (folder / "in.json").write_text("{}")
+    (folder / "tail.dat").touch()
     changes, words = BAD[fault]
     with pytest.raises(en4dvar.ConfigError) as caught:
         fit(section(**changes))

@@ -215,7 +215,7 @@ class Program:
             if status:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
                 advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.settings.retries else ""
-                lines = said.read().decode("utf-8", "replace").strip().splitlines()
+                lines = said.read().decode("utf-8", "replace").replace(f"{folder}{os.sep}", "").strip().splitlines()
                 reason = f": {lines[-1].strip()[-LAST_WORDS:]}" if lines else ""
                 how = "was ended by" if status < 0 else "ended with"
                 raise ProgramError(f"the program {how} {status_named(status)}{reason}{advice}")
