@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from en4dvar.inputs.implausible import (
     APART,
+    SHOTS,
     check_order,
     cut_off,
     level_top,
+    once_more,
     outlying,
     placeholders,
     scatter_of,
@@ -28,8 +30,8 @@ from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.hints import percent, suggest
+from en4dvar.plumbing.units import convert, unit_after
 
 Rows = npt.NDArray[np.intp]
 AGAIN = "one number again and again, far above all others, as a missing reading may be written"
@@ -106,6 +108,18 @@ class Readings:
         if clock is None or len(times) < 3:
             return left_out
         return left_out + step_doubts(times, clock.target, clock.unit, self.scalars, clock.rate)
+
+    def doubts_of(self, window: slice, start: Instant) -> tuple[Caution, ...]:
+        """:attr:`doubts`, and what stands outside the window where it begins at the largest reading."""
+        k = once_more(self.values, window) if start.kind in ("maximum", "top") else None
+        if k is None:
+            return self.doubts
+        share, where = percent(self.values[k] / self.values.max()), f"in reading {k + 1}"
+        if self.clock is not None:
+            at = convert(self.times[k], self.clock.target, self.clock.unit)
+            where = f"at {at:.6g}{unit_after(self.clock.unit)} of the file"
+        words = f"outside the window the readings rise to {share} of their largest once more, {where}: several shots?"
+        return (*self.doubts, Caution("implausible-data", "caution", words, SHOTS))
 
     def rows_among(self, size: int, used: slice) -> Rows:
         """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file. There is
