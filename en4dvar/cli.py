@@ -12,16 +12,20 @@ import threading
 from contextlib import suppress
 from typing import Any
 
-import click
+try:
+    import click
 
-from en4dvar.commands.common import Failed, give_up_output, printable, require_words, to_continue
-from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
-from en4dvar.commands.results import compare, export, joint, population, report, rerun
-from en4dvar.commands.run import run, validate
-from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
-from en4dvar.plumbing.errors import En4dvarError
-from en4dvar.plumbing.installed import installed
-from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
+    from en4dvar.commands.common import Failed, give_up_output, printable, require_words, to_continue
+    from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
+    from en4dvar.commands.results import compare, export, joint, population, report, rerun
+    from en4dvar.commands.run import run, validate
+    from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
+    from en4dvar.plumbing.errors import En4dvarError
+    from en4dvar.plumbing.installed import installed
+    from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
+except KeyboardInterrupt:  # before there is a command that would tell it
+    print("interrupted", file=sys.stderr)
+    sys.exit(130)
 
 # Told by what writes; here is what is left
 OF_THE_DEVICE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)

@@ -183,7 +183,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
             places=places.places(len(times), stated.get("places")) if places else None,
             source=readable(path),
             scalars=read.scalars,
-            doubts=read.doubts,
+            doubts=read.doubts_of(window, asked.start),
             continued=(read.times[whole] - zero, read.values[whole], errors(whole))
             if window.stop < whole.stop and data.error.separate and not places
             else None,

@@ -98,6 +98,7 @@ class InitialStates:
         fields = {f.name: f for f in layout}
         for prior, columns in self.problem.columns_of_fields:
             where = layout[prior.field.name]
+            _require_base(states[:, where], prior.field.name, prior.relative)
             states[:, where] = prior.applied(states[:, where], cells[:, columns])
             _require_inside(states[:, where], prior.field)
         for perturbation, column in self.perturbed:
@@ -107,10 +108,19 @@ class InitialStates:
                 value = value * np.array(perturbation.pattern)
                 value = np.exp(value) if perturbation.relative else value
             where = layout[perturbation.field]
+            _require_base(states[:, where], perturbation.field, perturbation.relative)
             states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
         for name in {perturbation.field for perturbation, _ in self.perturbed}:
             _require_inside(states[:, layout[name]], fields[name])
         return states
+
+
+def _require_base(states: Array, name: str, relative: bool) -> None:
+    """Raise ValueError where a field is to vary by a factor and is zero."""
+    if relative and not states.any():
+        raise ValueError(
+            f"{name} begins at 0, of which no share is a spread: give initial_state.{name}.std in its unit"
+        )
 
 
 def _require_inside(values: Array, block: Field) -> None:

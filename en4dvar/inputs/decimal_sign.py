@@ -22,14 +22,19 @@ _GROUPED: dict[str, re.Pattern[str]] = {
     ".": re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+(,\d+)?"), ",": re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+(\.\d+)?")
 }  # fmt: skip
 _SET_APART = re.compile(r"[-+]?[1-9]\d{0,2}(['’´` \u00a0\u2009\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
+_FORTRAN = re.compile(r"^([-+]?(?:\d+[.,]\d*|[.,]\d+))[dD]([-+]?\d{1,3})$")  # double precision, with a decimal sign
 UNEVEN = math.log(1000) / 2  # of the sum of all steps of ln: one wrong reading among right ones is a step of ln 1000
 AGAINST_FORM = 4  # as many times as uneven: then numbers contradict the form of others
 SEVERAL = 2  # other numbers that are needed: a single one, again and again, may stand for missing readings
 
 
 def closed_up(cell: str) -> str:
-    """A number without the blanks or apostrophes between its thousands, its minus as Python writes it."""
-    cell = cell.replace("\u2212", "-")
+    """A number without the blanks or apostrophes between its thousands, its minus and exponent as Python writes them.
+
+    >>> closed_up("2 000"), closed_up("1.5D-03"), closed_up("3D1")
+    ('2000', '1.5e-03', '3D1')
+    """
+    cell = _FORTRAN.sub(r"\1e\2", cell.replace("\u2212", "-"))
     match = _SET_APART.fullmatch(cell)
     return cell.replace(match[1], "") if match else cell
 

@@ -255,6 +255,22 @@ def _off(frames: Array) -> Array:
     return np.abs(frames - np.maximum(np.rint(frames), 1))
 
 
+AS_LARGE, FALLEN = 0.8, 0.5  # of the largest reading: no rebound is as high as that, behind such a fall
+SHOTS = "if there are several, each is a data set: give each a file, or a window that begins and ends at times"
+
+
+def once_more(values: Array, window: slice) -> int | None:
+    """Outside a window that begins at the largest of ``values`` (K,), a reading nearly as large, of another event
+    whatever they are readings of, for they fall between; None where there is none.
+    """
+    low = np.flatnonzero(values < FALLEN * values[window.start])
+    before, after = low[low < window.start], low[low > window.start]
+    ends = before[-1] if len(before) else 0, max(window.stop, after[0]) if len(after) else len(values)
+    tops = [int(np.argmax(values[: ends[0]]))] if ends[0] else []
+    tops += [ends[1] + int(np.argmax(values[ends[1] :]))] if ends[1] < len(values) else []
+    return next((int(k) for k in tops if values[k] > AS_LARGE * values[window.start]), None)
+
+
 APART = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
 SEVERAL = 4  # readings: a series has as many, and two of them as many each while both go on
 

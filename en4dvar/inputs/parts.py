@@ -220,7 +220,7 @@ def _column(variables: Variables, name: str, path: Path) -> Array:
     rest = [f"{k} ({what})" for k, what in variables.others.items() if k != name]
     there = f"{listed(sorted(variables.vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
     matrix = name if name in variables.matrices else next(iter(variables.matrices), None)
-    hint = f"; columns of a matrix are {matrix}(:,1), {matrix}(:,2), …" if matrix else ""
+    hint = f"; columns of a matrix are {matrix}(:,1), {matrix}(:,2), …, rows {matrix}(1,:), …" if matrix else ""
     raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}{hint}")
 
 

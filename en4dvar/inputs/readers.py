@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from en4dvar.inputs.implausible import (
     APART,
+    SHOTS,
     check_order,
     cut_off,
     level_top,
+    once_more,
     outlying,
     placeholders,
     scatter_of,
@@ -28,8 +30,8 @@ from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.hints import percent, suggest
+from en4dvar.plumbing.units import convert, unit_after
 
 Rows = npt.NDArray[np.intp]
 AGAIN = "one number again and again, far above all others, as a missing reading may be written"
@@ -107,6 +109,18 @@ class Readings:
             return left_out
         return left_out + step_doubts(times, clock.target, clock.unit, self.scalars, clock.rate)
 
+    def doubts_of(self, window: slice, start: Instant) -> tuple[Caution, ...]:
+        """:attr:`doubts`, and what stands outside the window where it begins at the largest reading."""
+        k = once_more(self.values, window) if start.kind in ("maximum", "top") else None
+        if k is None:
+            return self.doubts
+        share, where = percent(self.values[k] / self.values.max()), f"in reading {k + 1}"
+        if self.clock is not None:
+            at = convert(self.times[k], self.clock.target, self.clock.unit)
+            where = f"at {at:.6g}{unit_after(self.clock.unit)} of the file"
+        words = f"outside the window the readings rise to {share} of their largest once more, {where}: several shots?"
+        return (*self.doubts, Caution("implausible-data", "caution", words, SHOTS))
+
     def rows_among(self, size: int, used: slice) -> Rows:
         """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file. There is
         one a row of the file, one a usable row, or one a reading that is used. Raises :class:`DataError`.
@@ -162,7 +176,9 @@ def read_series(
         kept = kept[values[kept] > 0]
         codes = (values <= 0) & ((values < 0) | (np.arange(len(values)) >= first)) & ~np.isnan(times)
         left_out |= {BELOW: tuple(np.sort(times[codes]))} if codes.any() else {}
-    _check(times[kept], values[kept], value.name, path, fewest, zero)
+    for column in asked[: 1 + isinstance(time, Column)]:
+        _require_finite(columns[column.name], column.name, kept, lines, path)
+    _check(values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {c.name: _stds(c, converted[c], columns[c.name], kept, len(values), path) for c in errors}
@@ -241,13 +257,19 @@ def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, 
     return stds
 
 
-def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
+def _require_finite(column: Array, name: str, kept: Rows, lines: Sequence[int], path: Path) -> None:
+    """Raise :class:`DataError` where a number of the ``kept`` rows of a column is infinite."""
+    if len(wrong := kept[np.isinf(column[kept])]):
+        where = f":{lines[wrong[0]]}" if lines else f": sample {wrong[0] + 1}"
+        told = f"{column[wrong[0]]:g} in column {name!r}"
+        raise DataError(f"{path}{where}: {told}; correct it, or leave it blank (NaN) if the reading is missing")
+
+
+def _check(values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
         none = "blank" if zero else "blank, or not above zero"
         raise DataError(f"{path}: {name!r} holds no usable value (all NaN, or {none})")
-    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
-        raise DataError(f"{path}: infinite values")
     if len(values) < fewest:
         raise DataError(f"{path}: {len(values)} usable observations; at least {fewest} are needed")
 

@@ -189,12 +189,13 @@ def matches(path: Path, pattern: str) -> Iterator[list[str]]:
 
 
 def text_of(path: Path) -> str:
-    """What a program has written, its lines ended by ``\\n``; bytes that are no UTF-8 are replaced.
+    """What a program has written, without a mark of byte order, its lines ended by ``\\n``; bytes that are no UTF-8
+    are replaced.
 
     Raises :class:`DataError` where it cannot be read, or is longer than :data:`LONGEST_TEXT`.
     """
     with retold(OSError, DataError, f"no output file {path}: "):
-        return read_plain(path, LONGEST_TEXT).decode("utf-8", errors="replace").replace("\r\n", "\n")
+        return read_plain(path, LONGEST_TEXT).decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
 
 
 MOST_OBJECTS = 100_000

@@ -161,7 +161,7 @@ def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
     if label != symbol:
         label = f"{label} {symbol}" if "$" in symbol or len(symbol) > 1 else f"{label} ${symbol}$"
     zero = convert(float(np.broadcast_to(y.zero, len(y))[part.begin]), model.time_unit, model.time_display_unit)
-    panel = Panel(since(zero, model.time_display_unit), with_unit(label, shown_unit))
+    panel = Panel(since(zero, model.time_display_unit, float(times.max())), with_unit(label, shown_unit))
     if len(paths) > 1:
         for levels, alpha, words in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
             low, high = member_quantiles(paths, levels, axis=0)

@@ -11,6 +11,7 @@ import numpy as np
 from en4dvar.estimation.summary import estimate_cells, frame
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.history import history
@@ -41,7 +42,12 @@ class Result(StoredResult):
         return tree_of(self.groups)
 
     def dataset(self, group: str) -> xr.Dataset:
-        """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it."""
+        """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it. Raises
+        :class:`ConfigError`: there is none of the name.
+        """
+        if f"/{group}" not in self.groups:
+            there = sorted(name.strip("/") for name in self.groups if name != "/")
+            raise ConfigError(f"no group {shown(group)}{suggest(str(group), there)}; there are {listed(there)}")
         return dataset_of(self.group(group))
 
     @property

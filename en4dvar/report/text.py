@@ -203,15 +203,24 @@ def axis_label(variable: Variable, words: str = "") -> str:
     return with_unit(words or str(variable.attrs["symbol"]), display_unit(variable))
 
 
-def since(zero: float, unit: str) -> str:
-    """Of an axis of the model's times, at whose zero the clock of the data shows ``zero``, both in a display unit."""
-    return with_unit(f"time since {zero:.6g}{unit_behind(unit)} of the data" if zero else "time", unit)
+def since(zero: float, unit: str, reach: float) -> str:
+    """Of an axis of the model's times up to ``reach``, at whose zero the clock of the data shows ``zero``, all in a
+    display unit: to a thousandth of the axis, where nobody sees more.
+
+    >>> since(0.924895, "us", 30.0), since(3.0, "s", 1e-3), since(2500000.0, "1", 6.0)
+    ('time since 0.92 µs of the data (µs)', 'time since 3 s of the data (s)', 'time since 2500000 of the data')
+    """
+    if not zero:
+        return with_unit("time", unit)
+    places = 4 - math.ceil(math.log10(abs(reach) or 1))
+    return with_unit(f"time since {plain_number(round(zero, places), 9)}{unit_behind(unit)} of the data", unit)
 
 
 def time_axis(*times: Variable) -> str:
     """Of an axis of times of readings of a result file; of clocks that begin at other times it is the model's alone."""
     zeros = {float(shown(time, zero_of(time))) for time in times}
-    return since(zeros.pop() if len(zeros) == 1 else 0.0, display_unit(times[0]))
+    reach = max((float(np.nanmax(shown(time))) for time in times if time.values.size), default=1.0)
+    return since(zeros.pop() if len(zeros) == 1 else 0.0, display_unit(times[0]), reach)
 
 
 def figure_text(name: str) -> str:

@@ -51,7 +51,7 @@ def _kinds(r: Any) -> Iterator[Item]:
 
 SCOPES = {"kind": _kinds}
 BARE = UnitRule("its own: coordinate `units`", lambda _, item: {}, ())
-READ = UnitRule("its own: of a sequence coordinate `observation_units`", BARE.attributes, ())
+READ = UnitRule("its own: coordinate `observation_units`", BARE.attributes, ())
 NAME = UnitRule("", BARE.attributes, ())
 EACH = When("errors that differ in time", lambda r, _: r.series.std.ndim == 2)
 ALIKE = When("errors that do not", lambda r, _: r.series.std.ndim == 1)
@@ -94,6 +94,18 @@ def _coordinate(name: str, dims: str, meaning: str, values: Callable[[Any], Any]
     return Declared(name, dims, meaning, values, unit, fill=False)
 
 
+def _columns(r: Any) -> list[Observable]:
+    """The observable of each column of the readings; of a field the place, or its number, stands behind its name."""
+    named = {observable.name: observable for observable in r.problem.observables}
+    names = [name.split(" at ")[0] for name in r.series.names]
+    return [named[name if name in named else name.rpartition("_")[0]] for name in names]
+
+
+READING_COORDINATES: Table = (
+    _coordinate("observation", "observation", "what was observed", lambda r: text(r.series.names)),
+    _coordinate("observation_units", "observation", "unit of the observation",
+                lambda r: text(o.unit for o in _columns(r))),
+)  # fmt: skip
 STATE_COORDINATES: Table = (
     _coordinate("state", "state", "variable of the state", lambda r: text(name for name, _ in _states(r))),
     _coordinate("units", "state", "unit of the variable", lambda r: text(unit for _, unit in _states(r))),
@@ -106,12 +118,6 @@ MODEL_TIME = UnitRule("time of the model", lambda r, _: {"units": r.model.time_u
 CLOCK = UnitRule(
     MODEL_TIME.words, lambda r, _: {"units": r.model.time_unit, "display_units": r.model.time_display_unit}
 )
-
-
-def _columns(r: SeriesResult) -> list[Observable]:
-    """The observable of each column of the readings; of a field the place stands behind its name."""
-    named = {observable.name: observable for observable in r.problem.observables}
-    return [named[name.split(" at ")[0]] for name in r.series.names]
 
 
 def _state_read(observable: Observable, model: ForwardModel) -> str:
@@ -159,9 +165,7 @@ SEQUENCE_COORDINATES: Table = (
     _coordinate("symbol", "state", "how the variable is written in reports",
                 lambda r: text(s.symbol for s in _states_shown(r))),
     _coordinate("positive", "state", "1: the ensemble holds its logarithm", lambda r: _positive(r.problem)),
-    _coordinate("observation", "observation", "what was observed", lambda r: text(r.series.names)),
-    _coordinate("observation_units", "observation", "unit of the observation",
-                lambda r: text(o.unit for o in _columns(r))),
+    *READING_COORDINATES,
     _coordinate("observation_display_units", "observation", "unit of the observation in reports",
                 lambda r: text(o.display_unit for o in _columns(r))),
     _coordinate("observation_state", "observation", "variable of the state that was observed",
@@ -201,6 +205,7 @@ SCORES: Table = (
 TWIN_COORDINATES: Table = (
     _coordinate("time", "time", "observation time", lambda r: r.series.times, MODEL_TIME),
     *STATE_COORDINATES,
+    *READING_COORDINATES,
     _coordinate("dynamic", "state", "1: counts in RMSE and spread", lambda r: r.experiment.dynamic.astype(np.int8)),
 )
 TWIN_ATTRIBUTES = (

@@ -4,6 +4,8 @@ The engine does the rest, the same for every kind: it claims the directory and l
 answers interrupts, puts the result in place and writes the page. :mod:`en4dvar.results.kinds` lists the kinds.
 """
 
+import functools
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -224,10 +226,30 @@ def directory_mode(force: bool, resume: bool) -> Mode:
     return "force" if force else "resume" if resume else "new"
 
 
+_OPTIONS = (
+    (r"--(force|resume)\b", r"\1=True"),
+    (r"--out(?= .+ keeps both)", "the directory"),
+    (r"another --out\b", "another directory"),
+)
+
+
+@contextmanager
+def _advised_as_called(command: str) -> Iterator[None]:
+    """Where a function was called, whose name has no blank, an error advises its arguments in place of options."""
+    try:
+        yield
+    except En4dvarError as error:
+        if " " not in command:
+            words = functools.reduce(lambda text, option: re.sub(option[0], option[1], text), _OPTIONS, str(error))
+            error.args = (words,)
+        raise
+
+
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
     """Conduct a run in its directory; arguments and errors as of :func:`en4dvar.run`."""
     names = (*kind.files, *kind.pages)
     with (
+        _advised_as_called(command),
         one_blas_thread(),
         terminate_as_interrupt(),
         # first: what follows may compile the model
@@ -297,7 +319,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
         with run_log(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
             run = Session(config, directory, log, who, attributes)
             try:
-                log(attributes["history"])
+                log(attributes["history"].partition(" ")[2])  # its time is that of the line
                 yield run
                 log("done")
             except (ExecutorError, OutputError) as error:

@@ -27,6 +27,7 @@ from en4dvar.model.state import OF_READINGS, Array, Parameter, floats
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, OutputError, retold
 from en4dvar.plumbing.files import expanded, make_folder, temporary_folder, write_text
 from en4dvar.plumbing.hints import listed, suggest
+from en4dvar.plumbing.units import UnitError, parse_unit
 from en4dvar.plumbing.user_file import absolute, is_file_reference
 from en4dvar.report.result import Result
 from en4dvar.report.sequence import SequenceOutcome
@@ -342,6 +343,11 @@ class Given:
         self.units, self.priors, self.correlation = units, priors, correlation
         self.of_section = _of_section(model) if isinstance(model, str | Mapping) else None
         error, series = _from_here(error), _from_here(series)
+        names = observable if isinstance(observable, Sequence) else () if observable is None else (observable,)
+        if wrong := [name for name in names if not isinstance(name, str)]:
+            raise ConfigError(f"observable: {wrong[0]!r} is no name of a column; give a text, or a list of them")
+        if not isinstance(units, Mapping):
+            raise ConfigError("units: give a dict, e.g. {'k': '1/s'}")
         self.beside: dict[str, str] = {}
         with retold(DataError, DataError, "data: "):
             tables = tables_of(data, time, None if isinstance(observable, str) else observable)
@@ -428,6 +434,9 @@ class Given:
             raise ConfigError(
                 f"units: {sorted(unknown)[0]!r} is neither a parameter in priors nor a column of the data"
             )
+        for name, unit in self.units.items():
+            with retold(UnitError, ConfigError, f"units: {name}: "):
+                parse_unit(unit)
         parameters = [Parameter(name, self.units.get(name, "1")) for name in names]
         observables = {name: self.units.get(name, "1") for name in observed}
         return FunctionModel(function, parameters, observables, self.units.get(TIME, "1"), cheap=cheap)

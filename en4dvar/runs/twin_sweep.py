@@ -223,6 +223,8 @@ def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
         choices = parse_document(f"values: {choices}", f"--vary {key}").data["values"]
     if not isinstance(choices, list | tuple) or not choices:
         raise ConfigError(f"--vary {key}: give a list of values, e.g. --vary '{key}=[1.01, 1.05]'")
+    if again := [choice for i, choice in enumerate(choices) if choice in choices[:i]]:
+        raise ConfigError(f"--vary {key}: {again[0]} occurs twice; further runs of a setting are further --seeds")
     return tuple(choices)
 
 

@@ -149,7 +149,9 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSe
         with retold(ValueError, ConfigError, "twin.error_correlation: "):
             experiment.error_correlation.check_size(len(std))
         noise = experiment.error_correlation.correlated(noise)
-    return states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
+    each = zip(experiment.observables, widths, strict=True)
+    names = [f"{o.name}_{j}" if width > 1 else o.name for o, width in each for j in range(width)]
+    return states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation, tuple(names))
 
 
 def _truth(experiment: TwinExperiment, seed: int) -> Array:

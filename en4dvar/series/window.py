@@ -14,6 +14,7 @@ from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory, read_along
 from en4dvar.model.state import Array, floats
+from en4dvar.plumbing.hints import listed
 from en4dvar.schemes.asked import is_done, linearised, members_of, step_of
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 from en4dvar.schemes.localisation import BlockDescents, BlockLocalisation
@@ -59,10 +60,10 @@ def propagate(model: ForwardModel, states: Array, start: float, times: Array, ex
     return require_finite(np.array([floats(outcome.states) for outcome in outcomes if isinstance(outcome, Trajectory)]))
 
 
-def require_finite(paths: Array) -> Array:
-    """Paths (N, K, n) as they are. Raises :class:`MembersLost` for those that are not finite."""
+def require_finite(paths: Array, reason: str = "non-finite state") -> Array:
+    """Paths (N, K, n) as they are. Raises :class:`MembersLost` for those that are not finite, with the ``reason``."""
     if not np.isfinite(paths).all():
-        raise MembersLost(["" if np.isfinite(path).all() else "non-finite state" for path in paths])
+        raise MembersLost(["" if np.isfinite(path).all() else reason for path in paths])
     return paths
 
 
@@ -118,7 +119,12 @@ class Flow:
         physical = self.coordinates.to_physical(states)
         paths = propagate(self.model, physical, self.times[start], times, self.executor)
         moved = self.coordinates.from_physical(paths, states)
-        return require_finite(moved) if self.coordinates.logarithms else moved
+        if not self.coordinates.logarithms:
+            return moved
+        layout = self.model.layout
+        fell = listed([field.name for field in layout if not np.isfinite(moved[..., layout[field.name]]).all()])
+        advice = "give its initial_std in its unit, not in %, and leave it out of sequence.positive"
+        return require_finite(moved, f"{fell} is not positive, and cannot be estimated by its logarithm: {advice}")
 
     def elapsed(self, index: int) -> float:
         """Time between an observation and the one before it."""

@@ -12,6 +12,7 @@ from en4dvar.model.state import Array
 from en4dvar.report.chart import PAGE, Chart, Panel, Row
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
+from en4dvar.report.text import plain_number
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
 from en4dvar_movie.table import Scale
@@ -39,7 +40,7 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
         count=len(track.readings),
         used=len(used),
         what="frames" if len(scale.flashes) == 1 else "circles",
-        scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
+        scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {plain_number(scale.rate, 7)} frames a second",
         background=track.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
         factor=f"{100 * used[0].errors.factor:.2g}" if used and used[0].errors.factor > FELT else "",

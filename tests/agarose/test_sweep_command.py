@@ -24,7 +24,7 @@ def test_command(tmp_path):
     assert first.exit_code == 0, first.output
     assert "NRMSE" in first.output
     assert "given twice" in CliRunner().invoke(sweep_command, [call[0], *call]).output
-    with pytest.raises(OutputError, match=r"holds sweep\.csv of another command; give another --out"):
+    with pytest.raises(OutputError, match=r"holds sweep\.csv of another command; give another directory"):
         en4dvar.run(call[0], overrides={"output.directory": str(tmp_path)}, resume=True)
     table = (tmp_path / "sweep.csv").read_text().splitlines()
     assert table[0] == "dataset,G (kPa),alpha,mu (Pa s),R0 (um),t_s (us),NRMSE"

@@ -32,6 +32,19 @@ def test_cli_and_package_import_nothing_heavy() -> None:
     assert "numpy" in loaded("import en4dvar; en4dvar.Parameter")  # the check can fail
 
 
+def test_stopped_while_it_is_imported_the_program_ends_as_it_does_later() -> None:
+    script = """
+import sys
+class Stop:
+    def find_spec(self, name, *_):
+        if name == "en4dvar.commands":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Stop())
+from en4dvar.cli import main"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment())
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted\n")
+
+
 def test_units_and_errors_need_no_pydantic() -> None:
     assert not loaded("import en4dvar.plumbing.units, en4dvar.plumbing.errors").intersection(
         {"pydantic", "numba", "scipy"}

@@ -59,6 +59,8 @@ def test_run_prints_and_writes_the_scores(finished):
     with xr.open_dataset(directory / "twin.nc") as data:
         data.load()
     assert data.sizes == {"time": 30, "state": 13, "observation": 12}
+    assert data.observation.values.tolist() == [f"x_{j}" for j in range(12)]
+    assert data.observation_units.values.tolist() == ["1"] * 12
     error = (data.analysis_mean - data.truth)[:, :12]
     rmse = np.sqrt((error**2).mean("state"))
     assert np.allclose(rmse, data.analysis_rmse)

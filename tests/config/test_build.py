@@ -256,6 +256,22 @@ def test_outliers_that_were_left_out_are_told(tmp_path):
     assert "note: toy: readings left out" in CliRunner().invoke(main, ["validate", str(path)]).output
 
 
+@pytest.mark.parametrize(("heights", "window", "told"), [
+    ((96, 100, 90), "from: maximum, to: minimum", "rise to 96 % of their largest once more, at 3 ms of the file"),
+    ((100, 60, 99), "from: maximum, to: minimum", "rise to 99 % of their largest once more, at 23 ms of the file"),
+    ((100, 60, 30), "from: maximum, to: minimum", ""),
+    ((96, 100, 90), "from: 10 ms, to: 20 ms", ""),
+])  # fmt: skip
+def test_several_shots_in_a_file_are_told_where_the_window_takes_the_largest(tmp_path, heights, window, told):
+    rows = [f"{t},{heights[t // 10] * (1 - 0.025 * (t % 10 - 3) ** 2) + 5:.3f}" for t in range(30)]
+    path = write_toy(tmp_path, ("path: toy.csv", f"path: toy.csv\n  time_zero: window\n  window: {{{window}}}"))
+    (tmp_path / "toy.csv").write_text("t_ms,x_um\n" + "\n".join(rows))
+    (problem,) = build(load_config(path))
+    words = [doubt.words for doubt in problem.observations.doubts]
+    assert told in "".join(words)
+    assert bool(words) == bool(told)
+
+
 def test_a_share_of_the_maximum_is_that_of_each_data_set(tmp_path: Path) -> None:
     prior = "{prior: normal, mean: maximum, std: 1 %}"
     path = write_toy(tmp_path, ("toy.csv", "'*.csv'"), (prior, prior.replace("maximum", "13 % of maximum")))

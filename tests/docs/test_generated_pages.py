@@ -77,7 +77,7 @@ def test_every_row_of_a_series_has_the_words_of_its_meaning_and_unit(page):
         for row in re.findall(r"^\|[^|]*\| (`\w+`) \|[^|]*\| ([^|]*) \| ([^|]*) \|", page, re.M)
     }
     assert rows["`analysis_mean`"] == ("its own: coordinate `units`", "mean of the analysis ensemble")
-    assert rows["`predicted_mean`"][0] == "its own: of a sequence coordinate `observation_units`"
+    assert rows["`predicted_mean`"][0] == "its own: coordinate `observation_units`"
     assert (rows["`symbol`"][0], rows["`evidence`"][0]) == ("", "1")
     assert not [row for row in page.splitlines() if "the its" in row]
 

@@ -58,6 +58,14 @@ def test_relative_perturbation_is_a_factor():
     assert x.std(ddof=1) == pytest.approx(0.05)
 
 
+def test_a_share_of_what_begins_at_zero_is_no_spread():
+    problem = oscillator(("v", "5 %"))
+    run = forecast(problem, problem.prior.sample(6, 1))
+    assert set(run.failures) == {
+        "ValueError: v begins at 0, of which no share is a spread: give initial_state.v.std in its unit"
+    }
+
+
 def test_a_perturbation_leaves_the_state_of_the_model_alone():
     """The model's own array is not written to, and the other fields keep their values."""
     problem = oscillator(("v", "0.5 m/s"))

@@ -23,7 +23,7 @@ def test_lost_scheduler_is_one_clear_error_and_the_run_resumes(tmp_path):
     address = cluster.scheduler_address
     assert str(lost.value).startswith(f"lost the connection to the dask scheduler {address}; ")
     assert "of 4 data sets are done and kept" in str(lost.value)
-    assert str(lost.value).endswith("give --resume to continue")
+    assert str(lost.value).endswith("give resume=True to continue")
     assert lost.value.exit_code == 1
     assert run_campaign(configuration(path, out, executor="serial"), resume=True).exit_code == 0
     assert_same_results(out, tmp_path / "quiet")

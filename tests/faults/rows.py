@@ -29,7 +29,8 @@ class Row:
     kept: str
 
     def told(self, text: str) -> bool:
-        """Whether ``text`` holds the message."""
+        """Whether ``text`` holds the message, as the command line or a function tells it."""
+        text = text.replace("give resume=True", "give --resume")
         parts = (re.escape(part) for part in re.split(r"\{[^}]*\}", self.message))
         return re.search(".*".join(parts), text) is not None
 

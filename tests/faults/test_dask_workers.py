@@ -135,6 +135,6 @@ def test_without_any_worker_the_run_ends_and_can_be_resumed(tmp_path, cluster, i
         run_campaign(config, progress=lambda *_: end_workers(cluster))
     told = str(lost.value)
     assert told.startswith(f"dask scheduler {cluster.scheduler_address}: has had no worker for 2 s; ")
-    assert told.endswith(f"of 3 data sets are done and kept in {out}; give --resume to continue")
+    assert told.endswith(f"of 3 data sets are done and kept in {out}; give resume=True to continue")
     assert run_campaign(configuration(path, out, executor="serial"), resume=True).exit_code == 0
     assert_same_results(out, tmp_path / "quiet")

@@ -104,3 +104,9 @@ def test_data_sets_of_one_table_have_one_decimal_sign(tmp_path, german):
     layout, columns = Layout(by="gel", decimal=","), (Column("t", "s", "s"), Column("R", "um", "um"))
     each = [read_series(tmp_path / "a.csv", *columns, layout, part=part).values.tolist() for part in "ab"]
     assert each == [[998.2, 1001.5, 1003], [1201, 1300, 1405]]
+
+
+def test_exponents_of_fortran(tmp_path):
+    columns = contents(tmp_path, "t R\n1.0D-06 2.5D+01\n2.0d-6 .3D2\n3.0E-06 1.0D0\n", ".").columns
+    assert columns["t"].tolist() == [1e-6, 2e-6, 3e-6]
+    assert columns["R"].tolist() == [25, 30, 1]

@@ -108,7 +108,7 @@ def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> N
         ("Camera,X\n\nt,S\n0,1\n", "no column 'R'; the columns are: t, S\n"),
         ("t,R\n0,1\nus,um\n1,2\n", "a.csv:3: 'um' in column 'R' is not a number"),
         ("t,R\n0,1\n1,2\n", "2 usable observations; at least 3"),
-        ("t,R\n0,1\n1,inf\n2,3\n", "infinite"),
+        ("t,R\n0,1\n1,inf\n2,3\n", "a.csv:3: inf in column 'R'; correct it, or leave it blank"),
     ],
 )
 def test_bad_csv(tmp_path: Path, text: str, message: str) -> None:

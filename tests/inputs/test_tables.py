@@ -320,7 +320,10 @@ def test_columns_and_rows_of_matrices(tmp_path):
     rows = Column("T(*,:)", "um", "um")
     assert parts_of(path, rows) == tuple(f"T({k},:)" for k in range(1, 6))
     assert read_series(path, TIME, rows, part="T(5,:)").values.tolist() == radii[:, 4].tolist()
-    with pytest.raises(DataError, match=r"field 'M\(:,9\)' is not in the file; .* columns of a matrix are M\(:,1\)"):
+    with pytest.raises(
+        DataError,
+        match=r"field 'M\(:,9\)' is not in the file; .* columns of a matrix are M\(:,1\), M\(:,2\), …, rows M\(1,:\)",
+    ):
         read_series(path, time, Column("M(:,9)", "um", "um"))
 
 

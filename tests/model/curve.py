@@ -26,6 +26,8 @@ if what == "nothing":
     sys.exit()
 if what == "garbage":
     values = ["n/a" for _ in values]
+if what == "comma":
+    values = ["1,5" for _ in values]
 if what == "gaps" and int(1e7 * given["a"]) % 4 == 0:
     values[4] = "n/a"
 if what in ("fortran", "bare"):
@@ -33,6 +35,8 @@ if what in ("fortran", "bare"):
 if what == "short":
     values = values[1:]
 rows = "".join(f"{t}\t{y}\n" for t, y in zip(given["times"], values, strict=False))
-Path(target).write_text(rows if what == "bare" else "t\ty\n" + rows, encoding="utf-8")
+rows += "ended well\t\n" if what == "footer" else ""
+marked = "utf-8-sig" if what == "marked" else "utf-8"
+Path(target).write_text(rows if what == "bare" else "t\ty\n" + rows, encoding=marked)
 Path("out.json").write_text(json.dumps({"run": {"t": given["times"], "y": values}}), encoding="utf-8")
 print("".join(f"y = {y}\n" for y in values))

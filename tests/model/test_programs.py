@@ -120,6 +120,10 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "output: 11 values for 12 times; name the column of times" in failure(
         folder, "short", outputs={"y": {"column": "y"}}
     )
+    twice = {"y": {"file": "stdout", "pattern": r"(\S+)"}}
+    assert "times; the pattern is to match once for each value" in failure(folder, outputs=twice)
+    assert "output: times must increase, but the one of value 13 does not: nan follows 3" in failure(folder, "footer")
+    assert "'1,5' is no number; let the program write decimal points" in failure(folder, "comma")
     assert "times from 0 to 2.72727, but 0 to 3 are needed" in failure(folder, "short")
     assert "no column 'z'; the columns are: t, y" in failure(folder, outputs={"y": {"column": "z"}})
     missing = {"y": {"file": "out.json", "key": "run.z"}}
@@ -127,9 +131,11 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "not JSON" in failure(folder, outputs={"y": {"key": "run"}})
 
 
-@pytest.mark.parametrize(("what", "way"), [*(("fortran", way) for way in OUTPUTS), ("bare", "number of a column")])
+@pytest.mark.parametrize(
+    ("what", "way"), [*(("fortran", way) for way in OUTPUTS), ("bare", "number of a column"), ("marked", "column")]
+)
 def test_exponents_may_be_those_of_fortran(what, way, folder):
-    """1.03D+00; a table may have no header."""
+    """1.03D+00; a table may have no header, and begin with a mark of byte order."""
     (path,) = model_of(folder, what, outputs={"y": OUTPUTS[way]}).trajectories(np.array([[1.0, 0.5]]), TIMES)
     np.testing.assert_array_equal(path["y"], curve({"a": 1.0, "b": 0.5}, TIMES.tolist()))
 
@@ -210,9 +216,14 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         "model: command: {aa} is not something that can be filled in",
     ),
     "no input": ({"templates": []}, "model: command: {input} is the first of templates, and there is none"),
+    "a file left behind": (
+        {"command": "cat tail.dat > {output}", "shell": True, "templates": []},
+        "model: command: tail.dat is not in the scratch directory that each run has; write {here}/tail.dat, or name it",
+    ),
     "parameters": ({"parameters": {}}, "model.parameters: give at least 1"),
     "name": ({"parameters": {"a b": "1"}}, "model.parameters: 'a b' cannot be the name of a parameter"),
     "unit": ({"parameters": {"a": "metre per", "b": "1"}}, "model.parameters.a: unknown unit 'metre'"),
+    "unit 1": ({"parameters": {"a": 1, "b": "1"}}, "model.parameters.a: expected text; put it in quotes, not 1"),
     "bounds": (
         {"parameters": {"a": {"lower": 2, "upper": 1}, "b": "1"}},
         "model.parameters.a: lower (2) must lie below",
@@ -257,6 +268,7 @@ def test_each_wrong_value_is_one_located_message(fault, folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "in.json.tpl").write_text("{}")
     (folder / "in.json").write_text("{}")
+    (folder / "tail.dat").touch()
     changes, words = BAD[fault]
     with pytest.raises(en4dvar.ConfigError) as caught:
         fit(section(**changes))

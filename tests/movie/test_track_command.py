@@ -85,7 +85,8 @@ def test_a_lasting_shape_is_on_the_page_where_it_is_felt(factor, words):
     movie = movie_of(list(render(np.array([[20.0], [22.0]]), Scene(), np.random.default_rng(3))))
     seen = track(movie)
     readings = [replace(r, errors=replace(r.errors, factor=factor)) for r in seen.readings]
-    page = page_text(movie, replace(seen, readings=readings), Scale(2e-6, RATE), "en4dvar track")
+    page = page_text(movie, replace(seen, readings=readings), Scale(2e-6, 2.5e6), "en4dvar track")
+    assert "2 µm a pixel, 2500000 frames a second" in page
     assert page.count("A shape that lasts") == page.count("wrong by 0.3 %") == words
 
 

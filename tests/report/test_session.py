@@ -36,6 +36,11 @@ def test_a_posterior_is_shown_in_one_line_with_units(result: Result, analysis: e
     assert repr(result).startswith(f"<Result {result.name}: G {G.mean:.2g}"[:20])
 
 
+def test_a_group_that_is_not_there_is_told(result: Result) -> None:
+    with pytest.raises(en4dvar.ConfigError, match="no group 'posteriors'; did you mean 'posterior'"):
+        result.dataset("posteriors")
+
+
 def test_the_summary_is_a_table_in_display_units(result: Result) -> None:
     table = result.summary()
     with pd.option_context("display.max_columns", 3):  # as in a narrow terminal

@@ -1,6 +1,7 @@
 """Campaigns: what fails is named and ends nothing; one file for all; names that every file system takes."""
 
 import csv
+import re
 import shutil
 
 import netCDF4
@@ -144,6 +145,7 @@ def test_blocks_make_no_difference(campaign, tmp_path, monkeypatch):
 def test_the_log_says_where_descents_ended(campaign):
     """And takes no search for a worker that was lost and repeats itself."""
     log = (campaign.directory / "run.log").read_text(encoding="utf-8")
+    assert re.match(r"\S+ en4dvar", log)  # the time is told once
     assert log.count("descents ended at J") == len(list(campaign))
     assert "search for another minimum, round  1" in log
     assert "worker was lost" not in log

@@ -192,6 +192,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         "priors.a.mean: 0 has no unit; write e.g. '0 m'",
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
+    "unit unknown": ({"units": {"a": "1/mim"}}, "units: a: unknown unit 'mim'; did you mean"),
+    "units in a list": ({"units": ["a"]}, "units: give a dict, e.g. {'k': '1/s'}"),
+    "number of a column": ({"observable": 1}, "observable: 1 is no name of a column; give a text, or a list of them"),
+    "infinite": ({"data": (TIMES, np.where(TIMES > 2.9, np.inf, VALUES))}, "reading 12 of data: inf in column 'y'"),
     "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' cannot be the name of a parameter"),
     "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "nor is there initial_state or model_error; nothing"),
     "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
@@ -375,3 +379,9 @@ def test_a_warning_shows_a_time_without_a_unit_as_a_number():
     told = "\n".join(map(str, result.warnings))
     assert "frames of 0.2727, the first from 0 to 0.35: is a time wrong?" in told
     assert "the reading at 0 on the clock of the data" in told
+
+
+def test_a_directory_that_is_not_empty_is_told_in_arguments_of_the_function(tmp_path):
+    fit(directory=tmp_path / "a")
+    with pytest.raises(en4dvar.OutputError, match=r"; force=True replaces it, the directory \S+a_2 keeps both$"):
+        fit(directory=tmp_path / "a")

@@ -129,6 +129,7 @@ def test_warnings_of_single_runs_are_told(tmp_path):
         ({"assimilation.inflation": "[1, 2"}, r"--vary assimilation\.inflation:1:"),
         ({"assimilation.scheme": ["etkf", "best"]}, r"--set assimilation\.scheme.*'best' is not one of"),
         ({"assimilation.schema": ["etkf"]}, "unknown key 'schema'"),
+        ({"assimilation.inflation": [1.1, 1.1]}, r"--vary assimilation\.inflation: 1\.1 occurs twice; .* --seeds"),
         ({"seed": [1, 2]}, r"^--vary seed: .* --seeds"),
         ({}, "at least one key to vary"),
     ],

@@ -11,6 +11,7 @@ import pytest
 
 from en4dvar.assembly.build import build_sequence
 from en4dvar.config import load_sequence
+from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.runs.checks import validate
 from en4dvar.series.problem import assimilate_series
 
@@ -53,6 +54,14 @@ def test_every_scheme_covers_it(scheme):
     truth = np.loadtxt("truth.csv", delimiter=",")[:, 1:]
     assert covered(result.run.analysis, truth).mean() > 0.87
     assert np.sqrt(np.nanmean(result.normalised**2)) == pytest.approx(1, abs=0.15)
+
+
+def test_a_share_of_what_changes_its_sign_is_told_with_what_to_write():
+    config = load_sequence("l63.yaml", {"sequence.initial_std": {"x": "10 %", "y": 1, "z": 1}})
+    with pytest.raises(
+        TooFewMembersError, match=r"x is not positive, and .* logarithm: give its initial_std in its unit"
+    ):
+        assimilate_series(build_sequence(config), config.seed)
 
 
 def test_from_arrays(capsys):

@@ -34,6 +34,12 @@ from en4dvar.plumbing.hints import listed, short
 from en4dvar.plumbing.tables import COMMENT, is_number
 from en4dvar.plumbing.user_code import Code, require_permission
 
+COUNTED = {  # what helps where a way of reading gives too few values, or too many
+    "": "name the column of times",
+    "pattern": "the pattern is to match once for each value, and nowhere else",
+    "instructions": "say by observations which of them are used",
+}
+
 
 def read(
     output: OutputOf, folder: Path, times: Array, texts: Mapping[Path, str], seconds: float | None = None
@@ -60,7 +66,8 @@ def read(
         if output.time is not None:
             return _at(times, find(text, output.time, file), values, file)
     if len(values) != len(times):
-        raise ProgramError(f"{file}: {len(values)} values for {len(times)} times; name the column of times")
+        way = "pattern" if output.pattern is not None else "instructions" if output.instructions else ""
+        raise ProgramError(f"{file}: {len(values)} values for {len(times)} times; {COUNTED[way]}")
     return values
 
 
@@ -75,8 +82,11 @@ def _instructed(output: OutputOf, folder: Path, texts: Mapping[Path, str]) -> Ar
 
 
 def _at(times: Array, own: Array, values: Array, file: str) -> Array:
-    if len(own) != len(values) or len(own) < 1 or not np.all(np.diff(own) > 0):
-        raise ProgramError(f"{file}: {len(own)} times for {len(values)} values, or times that do not increase")
+    if len(own) != len(values) or len(own) < 1:
+        raise ProgramError(f"{file}: {len(own)} times for {len(values)} values")
+    if len(wrong := np.flatnonzero(~(np.diff(own) > 0)) + 1):
+        told = f"{own[wrong[0]]:g} follows {own[wrong[0] - 1]:g}"
+        raise ProgramError(f"{file}: times must increase, but the one of value {wrong[0] + 1} does not: {told}")
     slack = 1e-9 * max(abs(own[0]), abs(own[-1]))
     if times[0] < own[0] - slack or times[-1] > own[-1] + slack:
         needed = f"{times[0]:g} to {times[-1]:g} are needed"
@@ -118,7 +128,9 @@ def _numbers(texts: list[Any], file: str) -> Array:
     plain = [languages.plain(text) if isinstance(text, str) else text for text in texts]
     values = np.array([float(value) if is_number(value) else math.nan for value in plain])
     if len(texts) and np.isnan(values).all():
-        raise ProgramError(f"{file}: {short(str(texts[0]))!r} is no number")
+        comma = is_number(languages.plain(str(texts[0]).replace(",", ".")))
+        advice = "; let the program write decimal points, e.g. by environment: {LC_ALL: C}" if comma else ""
+        raise ProgramError(f"{file}: {short(str(texts[0]))!r} is no number{advice}")
     return values
 
 
@@ -202,7 +214,7 @@ class Program:
             if status:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
                 advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.settings.retries else ""
-                lines = said.read().decode("utf-8", "replace").strip().splitlines()
+                lines = said.read().decode("utf-8", "replace").replace(f"{folder}{os.sep}", "").strip().splitlines()
                 reason = f": {lines[-1].strip()[-LAST_WORDS:]}" if lines else ""
                 how = "was ended by" if status < 0 else "ended with"
                 raise ProgramError(f"the program {how} {status_named(status)}{reason}{advice}")

@@ -8,7 +8,7 @@ import shlex
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -27,6 +27,7 @@ STDOUT = "stdout"  # what the program prints, as a file
 LOGARITHM = "log10("  # how a term log10(name) of a combination begins
 OWN_NAMES = ("input", "output", "here", "python", TIMES)
 _NAME = re.compile(r"\{([A-Za-z_]\w*)\}")
+_WRITTEN = re.compile(r">+\s*\S+")  # into a file, by a shell
 WAYS = ("column", "key", "pattern", "instructions")
 
 
@@ -168,7 +169,7 @@ class OutputOf(Described):
 
 
 def _with_unit(text: Any) -> Any:
-    return {"unit": text} if isinstance(text, str) else text
+    return {"unit": text} if isinstance(text, str | int | float) else text
 
 
 UnitOrSection = Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]
@@ -237,7 +238,7 @@ class CommandSettings(Described):
     """Folder that holds the scratch directories; default the system's for temporary files."""
 
     @model_validator(mode="after")
-    def _belong_together(self) -> Self:
+    def _belong_together(self, info: ValidationInfo) -> Self:
         known = {*self.parameters, "input", "output"}
         for name in _NAME.findall(self.command):
             if name not in known:
@@ -254,7 +255,17 @@ class CommandSettings(Described):
         written = [*self.templates, *(file.name for file in self.files), OUTPUT, STDOUT]
         if double := {name for name in written if written.count(name) > 1}:
             raise ValueError(f"templates and files: two of them become {min(double)!r} in the scratch directory")
+        if lacking := left_behind(self.command, _base(info), written):
+            where = f"write {{here}}/{lacking}, or name it in files"
+            raise ValueError(f"command: {lacking} is not in the scratch directory that each run has; {where}")
         return self
+
+
+def left_behind(command: str, folder: Path, there: Sequence[str]) -> str:
+    """The first word of a command that names a file of ``folder``, and none of those ``there`` where it runs; or ""."""
+    words = [word.strip("'\"") for word in _WRITTEN.sub("", command).split()]
+    named = [word for word in words if "." in word and not Path(word).is_absolute() and Path(word).name not in there]
+    return next((word for word in named if (folder / word).is_file()), "")
 
 
 def fill(word: str, values: Mapping[str, str]) -> str:
