@@ -235,11 +235,11 @@ _OPTIONS = (
 
 @contextmanager
 def _advised_as_called(command: str) -> Iterator[None]:
-    """Where a function was called, whose name has no blank, an error advises its arguments in place of options."""
+    """Where a function was called instead of a ``command``, an error advises its arguments in place of options."""
     try:
         yield
     except En4dvarError as error:
-        if " " not in command:
+        if not re.match("en4dvar( |$)", command):
             words = functools.reduce(lambda text, option: re.sub(option[0], option[1], text), _OPTIONS, str(error))
             error.args = (words,)
         raise
