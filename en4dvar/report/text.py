@@ -210,10 +210,8 @@ def since(zero: float, unit: str, reach: float) -> str:
     >>> since(0.924895, "us", 30.0), since(3.0, "s", 1e-3), since(2500000.0, "1", 6.0)
     ('time since 0.92 µs of the data (µs)', 'time since 3 s of the data (s)', 'time since 2500000 of the data')
     """
-    if not zero:
-        return with_unit("time", unit)
-    places = 4 - math.ceil(math.log10(abs(reach) or 1))
-    return with_unit(f"time since {plain_number(round(zero, places), 9)}{unit_behind(unit)} of the data", unit)
+    seen = zero and round(zero, 4 - math.ceil(math.log10(abs(reach) or 1)))
+    return with_unit(f"time since {plain_number(seen, 9)}{unit_behind(unit)} of the data" if seen else "time", unit)
 
 
 def time_axis(*times: Variable) -> str:

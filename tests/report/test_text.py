@@ -37,6 +37,7 @@ NAN = float("nan")
         ),
         (is_math, [r"$\mu_{max}$", r"$\frac{1}{2}R^2$", r"$\input{x}$", "$a}b{c$"], [True, True, False, False]),
         (latex_unit, ["um", "Pa s", "m s-1", "%", "1"], [r"$\mu$m", r"Pa\,s", r"m\,s$^{-1}$", r"\%", ""]),
+        (text.since, [(2.0, "s", 30.0), (0.004, "s", 30.0)], ["time since 2 s of the data (s)", "time (s)"]),
         (ramp, [(GREYS, 0.0), (GREYS, 1.0)], ["#ffffff", "#000000"]),
     ],
 )
