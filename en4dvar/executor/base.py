@@ -322,7 +322,7 @@ class PoolExecutor(FuturesExecutor):
 
     def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future[T]:
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="en4dvar")
+            self._pool = ThreadPoolExecutor(self.workers, "en4dvar", lambda: starts_again([threading.get_ident()]))
         return self._pool.submit(function, *call, *([tell] if tell else []))
 
     def _value(self, future: Future[T]) -> T | Exception:

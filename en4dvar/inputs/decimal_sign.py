@@ -34,7 +34,9 @@ def closed_up(cell: str) -> str:
     >>> closed_up("2 000"), closed_up("1.5D-03"), closed_up("3D1")
     ('2000', '1.5e-03', '3D1')
     """
-    cell = _FORTRAN.sub(r"\1e\2", cell.replace("\u2212", "-"))
+    cell = cell.replace("\u2212", "-")
+    if "d" in cell or "D" in cell:  # cells are many
+        cell = _FORTRAN.sub(r"\1e\2", cell)
     match = _SET_APART.fullmatch(cell)
     return cell.replace(match[1], "") if match else cell
 

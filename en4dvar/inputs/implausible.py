@@ -260,9 +260,11 @@ SHOTS = "if there are several, each is a data set: give each a file, or a window
 
 
 def once_more(values: Array, window: slice) -> int | None:
-    """Outside a window that begins at the largest of ``values`` (K,), a reading nearly as large, of another event
-    whatever they are readings of, for they fall between; None where there is none.
+    """Outside a window that begins at the largest of ``values`` (K,), a reading nearly as large, of another event, for
+    they fall between; None where there is none, and of what swings about zero, which rises again by itself.
     """
+    if values.min() < -FALLEN * values[window.start]:
+        return None
     low = np.flatnonzero(values < FALLEN * values[window.start])
     before, after = low[low < window.start], low[low > window.start]
     ends = before[-1] if len(before) else 0, max(window.stop, after[0]) if len(after) else len(values)

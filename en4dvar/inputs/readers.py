@@ -177,7 +177,7 @@ def read_series(
         codes = (values <= 0) & ((values < 0) | (np.arange(len(values)) >= first)) & ~np.isnan(times)
         left_out |= {BELOW: tuple(np.sort(times[codes]))} if codes.any() else {}
     for column in asked[: 1 + isinstance(time, Column)]:
-        _require_finite(columns[column.name], column.name, kept, lines, path)
+        _require_finite(columns[column.name], column.name, kept[np.isinf(converted[column][kept])], lines, path)
     _check(values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
@@ -257,9 +257,9 @@ def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, 
     return stds
 
 
-def _require_finite(column: Array, name: str, kept: Rows, lines: Sequence[int], path: Path) -> None:
-    """Raise :class:`DataError` where a number of the ``kept`` rows of a column is infinite."""
-    if len(wrong := kept[np.isinf(column[kept])]):
+def _require_finite(column: Array, name: str, wrong: Rows, lines: Sequence[int], path: Path) -> None:
+    """Raise :class:`DataError` where there are rows ``wrong``, infinite in the model's unit."""
+    if len(wrong):
         where = f":{lines[wrong[0]]}" if lines else f": sample {wrong[0] + 1}"
         told = f"{column[wrong[0]]:g} in column {name!r}"
         raise DataError(f"{path}{where}: {told}; correct it, or leave it blank (NaN) if the reading is missing")

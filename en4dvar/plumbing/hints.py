@@ -69,11 +69,14 @@ def rounded(*counts: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time as people say it, to two digits."""
-    for limit, unit, size in ((1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)):
-        if seconds < limit:
-            return f"{float(f'{seconds / size:.2g}'):g} {unit}"
-    return f"{seconds / 3600:.2g} h"
+    """A time as people say it, to two digits.
+
+    >>> duration(0.05), duration(150), duration(7e5)
+    ('50 ms', '2.5 min', '190 h')
+    """
+    sizes = (1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)
+    unit, size = next(((unit, size) for limit, unit, size in sizes if seconds < limit), ("h", 3600.0))
+    return f"{float(f'{seconds / size:.2g}'):g} {unit}"
 
 
 def percent(share: float) -> str:

@@ -68,10 +68,14 @@ def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem
 
 def require_together(config: Config, problem: InverseProblem, files: Mapping[str, DataFile]) -> None:
     """Raise :class:`ConfigError` where data ``files``, such as that of ``problem``, are to be estimated together, and
-    cannot be: one is in no group, they have no population, two hold the same readings.
+    cannot be: some are in no group, they have no population, two hold the same readings.
     """
+    faults: list[Fault] = []
     for name in files:
-        config.sharing.of_dataset(name)
+        with config.document.collecting(faults):
+            config.sharing.of_dataset(name)
+    if faults:
+        raise ConfigError(faults)
     require_population(config, problem, files)
     if not (config.sharing.kinds or config.population):
         return

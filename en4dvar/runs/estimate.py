@@ -6,7 +6,7 @@ directory, so that everything a configuration can say can be said here, in the s
 
 import pickle
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -343,7 +343,7 @@ class Given:
         self.units, self.priors, self.correlation = units, priors, correlation
         self.of_section = _of_section(model) if isinstance(model, str | Mapping) else None
         error, series = _from_here(error), _from_here(series)
-        names = observable if isinstance(observable, Sequence) else () if observable is None else (observable,)
+        names = () if observable is None else observable if isinstance(observable, Iterable) else (observable,)
         if wrong := [name for name in names if not isinstance(name, str)]:
             raise ConfigError(f"observable: {wrong[0]!r} is no name of a column; give a text, or a list of them")
         if not isinstance(units, Mapping):

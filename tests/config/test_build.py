@@ -261,6 +261,7 @@ def test_outliers_that_were_left_out_are_told(tmp_path):
     ((100, 60, 99), "from: maximum, to: minimum", "rise to 99 % of their largest once more, at 23 ms of the file"),
     ((100, 60, 30), "from: maximum, to: minimum", ""),
     ((96, 100, 90), "from: 10 ms, to: 20 ms", ""),
+    ((100, -98, 96), "from: maximum, to: minimum", ""),
 ])  # fmt: skip
 def test_several_shots_in_a_file_are_told_where_the_window_takes_the_largest(tmp_path, heights, window, told):
     rows = [f"{t},{heights[t // 10] * (1 - 0.025 * (t % 10 - 3) ** 2) + 5:.3f}" for t in range(30)]

@@ -150,6 +150,7 @@ def test_all_share_it(tmp_path):
     [
         (SHARED, GROUPS.replace("spring", "springs"), r"yaml:1\d:\d+: .*no kind of 'groups:' is called 'spring'.*spri"),
         (SHARED, GROUPS.replace(", set3", ""), r"toy\.yaml:\d+:\d+: .*data set 'set3' is in none of them"),
+        (SHARED, GROUPS.replace("set2, set3", "other"), r"set2' is in none of them\n.*'set3' is in none of them"),
         (SHARED, GROUPS.replace("set2,", "set1, set2,"), r"data set 'set1' is in several of them: soft, stiff"),
         (
             "k: {prior: lognormal, median: maximum, log_std: 0.3, shared: all}".replace("maximum", "3 N/m")

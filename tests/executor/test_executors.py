@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from toys import Decay, Dying, Fragile, Vectorised, make_problem
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, choose_executor, cut
 from en4dvar.model.forward import Failure
+from en4dvar.plumbing import children
 from en4dvar.plumbing.children import HaltedError, end_those_of, starts_again
 from en4dvar.results.checkpoint import Journal
 from en4dvar.schemes.settings import AssimilationSettings
@@ -133,3 +135,18 @@ def test_a_thread_that_is_to_stop_makes_no_further_forecast():
             journal.once(lambda: 1)
     finally:
         starts_again(me)
+
+
+def test_threads_of_a_run_are_not_stopped_by_numbers_that_an_earlier_run_has_left(monkeypatch):
+    """A thread that was in compiled code as Ctrl-C came ends later; the system gives its number again."""
+
+    class Every(set[int]):
+        def __contains__(self, number: object) -> bool:
+            return not super().__contains__(number)
+
+        def difference_update(self, *numbers: Any) -> None:
+            self.update(*numbers)
+
+    monkeypatch.setattr(children, "_stopped", Every())
+    with ThreadsExecutor(1) as executor:
+        assert list(executor.map(Journal(SerialExecutor()).once, [(int,)])) == [(0, 0)]

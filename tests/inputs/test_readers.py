@@ -118,6 +118,13 @@ def test_bad_csv(tmp_path: Path, text: str, message: str) -> None:
     assert str(tmp_path / "a.csv") in str(error.value)
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_a_number_that_is_infinite_in_the_unit_of_the_model_is_told_as_it_is_written(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,R\n0,1\n1,1e305\n2,3\n")
+    with pytest.raises(DataError, match=r"a\.csv:3: 1e\+305 in column 'R'"):
+        read_series(tmp_path / "a.csv", TIME, Column("R", "m", "um"))
+
+
 @pytest.mark.parametrize(
     "text", ["t;R\n0;1,5\n,5;2,5\n1;3\n", "t\tR\n0,0\t1,5\n0.5\t2,5\n1,0\t3\n", 't,R\n"0","1,5"\n"0,5","2,5"\n1,3\n']
 )

@@ -276,6 +276,16 @@ def test_each_wrong_value_is_one_located_message(fault, folder, monkeypatch):
     assert len(str(caught.value).splitlines()) == 1, str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "command", [f"{CURVE} own.csv", "cd {here} && cat tail.dat", "cp {here}/tail.dat .; cat tail.dat"]
+)
+def test_a_file_that_the_command_writes_fetches_or_goes_to_is_not_left_behind(command, folder):
+    """Beside the configuration, ``own.csv`` is what an earlier run by hand has left."""
+    for name in ("own.csv", "tail.dat"):
+        (folder / name).touch()
+    model_of(folder, command=command, shell=True, templates=[], outputs={"y": {"file": "own.csv", "column": 2}})
+
+
 def test_a_template_cannot_reach_what_a_sandbox_hides(folder):
     (folder / "in.json.j2").write_text("{{ a.__class__.__mro__ }}")
     assert "SecurityError" in failure(folder)

@@ -255,6 +255,7 @@ class CommandSettings(Described):
         written = [*self.templates, *(file.name for file in self.files), OUTPUT, STDOUT]
         if double := {name for name in written if written.count(name) > 1}:
             raise ValueError(f"templates and files: two of them become {min(double)!r} in the scratch directory")
+        written += [Path(output.file).name for output in self.outputs.values()]
         if lacking := left_behind(self.command, _base(info), written):
             where = f"write {{here}}/{lacking}, or name it in files"
             raise ValueError(f"command: {lacking} is not in the scratch directory that each run has; {where}")
@@ -262,7 +263,11 @@ class CommandSettings(Described):
 
 
 def left_behind(command: str, folder: Path, there: Sequence[str]) -> str:
-    """The first word of a command that names a file of ``folder``, and none of those ``there`` where it runs; or ""."""
+    """The first word of a command that names a file of ``folder``, and none of those ``there`` where it runs; or "",
+    also of several commands, of which one may bring the file, or change the folder.
+    """
+    if re.search(r"[;\n]|&&", command):
+        return ""
     words = [word.strip("'\"") for word in _WRITTEN.sub("", command).split()]
     named = [word for word in words if "." in word and not Path(word).is_absolute() and Path(word).name not in there]
     return next((word for word in named if (folder / word).is_file()), "")
