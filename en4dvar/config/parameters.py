@@ -15,7 +15,7 @@ from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import brief, shown, suggest
-from en4dvar.plumbing.units import parse_quantity
+from en4dvar.plumbing.units import parse_quantity, unit_after
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying.model import can_vary
 
@@ -295,7 +295,7 @@ def _why_not(model: ForwardModel, parameter: Parameter) -> str:
 
 
 def _missing(parameter: Parameter) -> str:
-    unit = "" if parameter.display_unit == "1" else f" {parameter.display_unit}"
+    unit = unit_after(parameter.display_unit)
     return (
         f"{parameter.label} {parameter.name!r} (unit {parameter.display_unit}) has neither a prior nor a value; "
         f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"

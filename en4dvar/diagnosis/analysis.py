@@ -14,7 +14,7 @@ from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.hints import counted
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
@@ -220,7 +220,7 @@ class Analysis:
         told = []
         for p, values in zip(self.parameters, self.posterior.T, strict=True):
             mean, std = (convert(float(f(values)), p.unit, p.display_unit) for f in (np.nanmean, np.nanstd))
-            told.append(f"{p.name} {mean:.4g} ± {std:.2g} {p.display_unit}".removesuffix(" 1"))
+            told.append(f"{p.name} {mean:.4g} ± {std:.2g}{unit_after(p.display_unit)}")
         ended = "converged" if self.converged else "not converged"
         return f"<Analysis {self.name}: {', '.join(told)}; {ended}, warnings: {len(self.cautions)}>"
 

@@ -24,7 +24,7 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, write_text
 from en4dvar.plumbing.hints import counted, percent
 from en4dvar.plumbing.tables import csv_text, table
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
 from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, render_latex
@@ -150,7 +150,7 @@ class SequenceOutcome(SeriesResult):
     """The state and parameters along a series of data."""
 
     def __repr__(self) -> str:
-        told = [f"{name} {mean:.4g} ± {std:.2g} {unit}".removesuffix(" 1") for name, mean, std, unit in estimates(self)]
+        told = [f"{name} {mean:.4g} ± {std:.2g}{unit_after(unit)}" for name, mean, std, unit in estimates(self)]
         more = f" and {len(told) - MOST} more" if len(told) > MOST else ""
         about = f"{self.problem.name}, {counted(len(self.problem.series.times), 'time')}"
         return f"<SequenceOutcome {about}; at the end {', '.join(told[:MOST])}{more}>"

@@ -34,7 +34,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import beside, counted, listed
 from en4dvar.plumbing.tables import csv_text
-from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.plumbing.units import UnitError, convert, unit_after
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream
 from en4dvar.results.provenance import portable
@@ -196,7 +196,7 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
         if len({column.name for column in columns}) < len(columns):  # series of several files
             columns = [replace(column, name=plan.name) for column, plan in zip(columns, series, strict=True)]
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
-    truth = ", ".join(f"{name} = {v:.9g} {units[name]}".removesuffix(" 1") for name, v in simulation.theta.items())
+    truth = ", ".join(f"{name} = {v:.9g}{unit_after(units[name])}" for name, v in simulation.theta.items())
     columns = [time, *columns]
     comments = [*comment.splitlines(), f"parameters: {truth}", ", ".join(f"{c.name} in {c.unit}" for c in columns)]
     values = [simulation.times, *simulation.series.values()]

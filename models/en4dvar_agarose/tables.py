@@ -8,7 +8,7 @@ import numpy as np
 
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.tables import csv_text
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar.report import text
 from en4dvar.report.export import column_name, render_latex
 from en4dvar.sampling.sweep import SweepResult
@@ -158,7 +158,7 @@ def sweep_text(result: SweepResult) -> str:
     for p, *moments in zip(result.parameters, result.mean, result.std, strict=True):
         mean, std = (convert(float(v), p.unit, p.display_unit) for v in moments)
         value = text.plus_minus(mean, std) if std > 0 else f"{mean:.4g}"
-        shown = "" if p.display_unit == "1" else f" {p.display_unit}"
+        shown = unit_after(p.display_unit)
         lines.append(f"  {p.label}: {p.name} = {value}{shown}")
     fits = result.nrmse
     return "\n".join([*lines, f"  NRMSE {fits.min():.4f} to {fits.max():.4f}, mean {fits.mean():.4f}"])

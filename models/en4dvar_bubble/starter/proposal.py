@@ -14,7 +14,7 @@ from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.hints import listed
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, unit_after
 from en4dvar_bubble.collapse import conceivable, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
@@ -482,4 +482,4 @@ def _radii(
 def _text(value: float, unit: str, display: str, digits: int = 2) -> str:
     """A quantity to some digits in a readable unit, e.g. ``0.27 kPa``."""
     number = f"{float(f'{convert(value, unit, display):.{digits}g}'):g}"
-    return number if display == "1" else f"{number} {display}"
+    return f"{number}{unit_after(display)}"
