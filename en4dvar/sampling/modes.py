@@ -34,7 +34,8 @@ FEW = 6  # directions up to which that is the factor of each; of more it is smal
 THIN = 0.25  # effective share of draws of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
 ALONG, NEAR, VALLEY = np.linspace(0, 1, 17), 0.125, 0.5  # windows between modes, and the share of draws of a valley
-BESIDE, GAP, NOTHING, LOOKED = 5, 4.0, 0.005, 20  # draws beside a gap, its width, the share in all gaps, how many
+GAP, CHANCE = 4.0, 1e-4  # width of a gap over what lies beside it, and the chance of any among draws of one peak
+NOTHING, LOOKED = 0.005, 20  # the share in all gaps, and how many are looked at
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
 Cost = Callable[[Array], Array]
@@ -221,7 +222,7 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, 
     mode, new = np.zeros(len(x), dtype=np.intp), len(minima)
     if not minima:
         return mode
-    groups = separated(np.vstack([x, *(m.x for m in minima)]), np.append(shares, np.zeros(new)), BESIDE * for_one)
+    groups = separated(np.vstack([x, *(m.x for m in minima)]), np.append(shares, np.zeros(new)), for_one)
     for group in groups:
         own, inside = group[group < len(x)], group[group >= len(x)] - len(x)
         if len(inside):
@@ -231,13 +232,15 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, 
     return mode
 
 
-def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
+def separated(x: Array, shares: Array, for_one: float = 1.0) -> list[Indices]:
     """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
 
-    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density
-    with one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less
-    than :data:`NOTHING` leave it empty.
+    A gap is g = :data:`GAP` times as wide as k effective draws to either side of it, each of which is ``for_one``.
+    Between draws that are equally dense everywhere, a space has the chance (1 + g/2)^(−2(k − 1)) of that, at most; k
+    makes it :data:`CHANCE` for all D n spaces together. Of one peak of any other density the sparser side is the wider
+    one, and what is curved or bent leaves no gap. Draws that hold less than :data:`NOTHING` leave it empty.
     """
+    beside = for_one * (1 + math.log(max(x.size / for_one, 1.0) / CHANCE) / (2 * math.log(1 + GAP / 2)))
     order = np.argsort(shares, kind="stable")
     held = np.zeros(len(x), dtype=bool)
     held[order[np.cumsum(shares[order]) > NOTHING * shares.sum()]] = True

@@ -50,6 +50,15 @@ def test_draws_of_one_mode_are_one_group(shape, count):
         assert len(separated(x, weights / weights.sum())) == 1
 
 
+@pytest.mark.parametrize("shape", ["Gaussian", "uniform"])
+def test_a_gap_of_chance_is_as_rare_of_many_draws_and_coordinates(shape):
+    """Of 3000 spaces in a set of equal weights one in 10 000 sets may show one."""
+    for seed in range(400):
+        random = np.random.default_rng(seed)
+        x = SHAPES[shape](random, random.standard_normal((600, 5)))
+        assert len(separated(x, np.full(600, 1 / 600))) == 1
+
+
 def test_a_walker_that_creeps_in_a_tail_is_no_mode():
     """One of four leaves for 50 steps, of a chain of which 100 are worth a draw."""
     random = np.random.default_rng(2)
