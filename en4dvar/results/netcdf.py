@@ -55,6 +55,8 @@ def understood(path: Path) -> Iterator[None]:
     """Within, what a file with a good seal holds is read; whatever is wrong with it is an :class:`OutputError`."""
     try:
         yield
+    except MissingError as error:
+        raise OutputError(f"{path}: {error}") from error
     except OutputError:
         raise
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError) as error:

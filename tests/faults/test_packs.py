@@ -101,7 +101,7 @@ def require_mended(path, run, undamaged):
 
 def besieged(quiet, folder, monkeypatch, damages, seed, many):
     path, undamaged = quiet
-    monkeypatch.setattr(report, "draw", lambda *_, **__: {})
+    monkeypatch.setattr(report, "draw", lambda *_, **__: [])
     monkeypatch.setattr(report, "_write_page", lambda *_: None)
     content, whole, draw = (undamaged / PACK).read_bytes(), exported(undamaged)[0], random.Random(seed)
     hit = 0
