@@ -382,6 +382,8 @@ def test_a_warning_shows_a_time_without_a_unit_as_a_number():
 
 
 def test_a_directory_that_is_not_empty_is_told_in_arguments_of_the_function(tmp_path):
-    fit(directory=tmp_path / "a")
-    with pytest.raises(en4dvar.OutputError, match=r"; force=True replaces it, the directory \S+a_2 keeps both$"):
-        fit(directory=tmp_path / "a")
+    """In its name ``--force`` was written as ``force=True``."""
+    fit(directory=tmp_path / "a--force")
+    words = r"a--force: .+; force=True replaces it, the directory \S+a--force_2 keeps both$"
+    with pytest.raises(en4dvar.OutputError, match=words):
+        fit(directory=tmp_path / "a--force")
