@@ -103,7 +103,7 @@ def test_parameters_may_be_arguments_and_the_program_a_shell_line(folder):
 def test_no_shell_unless_asked_for(folder):
     model = model_of(
         folder,
-        command="echo {a} ; touch nowhere",
+        command="echo {a} ';' touch nowhere",
         templates=(),
         outputs={"y": {"file": "stdout", "pattern": r"(\S+)$"}},
     )
@@ -258,6 +258,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "limit unit": ({"time_limit": 3}, "model.time_limit: 3 has no unit; write e.g. '3 s'"),
     "retries": ({"retries": -1}, "model.retries: should be greater than or equal to 0"),
     "shell": ({"shell": "perhaps"}, "model.shell: "),
+    "no shell": ({"command": "'./a && b' > {output}"}, "the program would get > as an argument; write shell: true"),
     "scratch": ({"scratch": "nowhere"}, "nowhere: no such folder"),
     "key": ({"comand": "x"}, "model.comand: unknown key 'comand'; did you mean 'command'?"),
 }
