@@ -192,7 +192,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         "priors.a.mean: 0 has no unit; write e.g. '0 m'",
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
-    "unit unknown": ({"units": {"a": "1/mim"}}, "units: a: unknown unit 'mim'; did you mean"),
+    "unit unknown": ({"units": {"a": "1/mim"}}, "units: a: unknown unit 'mim'; did you mean 'mm' or 'min'?"),
     "units in a list": ({"units": ["a"]}, "units: give a dict, e.g. {'k': '1/s'}"),
     "number of a column": ({"observable": 1}, "observable: 1 is no name of a column; give a text, or a list of them"),
     "infinite": ({"data": (TIMES, np.where(TIMES > 2.9, np.inf, VALUES))}, "reading 12 of data: inf in column 'y'"),
