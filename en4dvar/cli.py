@@ -15,7 +15,7 @@ from typing import Any
 try:
     import click
 
-    from en4dvar.commands.common import Failed, give_up_output, printable, require_words, to_continue
+    from en4dvar.commands.common import Failed, give_up_output, printable, require_words, tell, to_continue
     from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
     from en4dvar.commands.results import compare, export, joint, population, report, rerun
     from en4dvar.commands.run import run, validate
@@ -69,7 +69,7 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         output = _output()
         try:
-            with typed(), heeded(_end), terminate_as_interrupt():
+            with typed(tell), heeded(_end), terminate_as_interrupt():
                 value = super().invoke(ctx)
             sys.stdout.flush()
             if _output() != output:  # what was printed is nowhere, or in a file that has its number now

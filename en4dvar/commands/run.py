@@ -63,7 +63,7 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
         from en4dvar.runs.progress import terminal_progress
         from en4dvar.runs.runner import run_campaign
 
-        with continuable(config.directory, resume) as command, terminal_progress() as progress:
+        with continuable() as command, terminal_progress() as progress:
             campaign = run_campaign(
                 config, force=force, resume=resume, progress=progress, command=command,
                 report_workers=config.execution.workers or available_cores(),
@@ -187,7 +187,7 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     from en4dvar.runs.engine import conduct_run
     from en4dvar.runs.progress import counted
 
-    with continuable(config.directory, resume) as command, counted("cycles") as tell:
+    with continuable() as command, counted("cycles") as tell:
         kind = cycles_of(config, lambda cycle: tell(cycle + 1, kind.cycles) if tell else None)
         result = conduct_run(kind, force, resume, command)
     echo(result.table())

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.executor.processes import end_unguarded
-from en4dvar.plumbing.called import ELSEWHERE, advised
+from en4dvar.plumbing.called import ELSEWHERE, advised, note
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, replace_file, write_text
 from en4dvar.results.kinds import KINDS, LISTING, kind_named, lines_of_list
@@ -66,6 +66,8 @@ class RunDirectory:
         end_unguarded()
         path = Path(path)
         home = path.absolute()
+        if mode == "resume":
+            note_beginning(path)
         if mode == "report" and not path.is_dir():
             raise OutputError(f"{path}: no such run directory")
         with ExitStack() as held:
@@ -154,6 +156,12 @@ class RunDirectory:
 def holds_run(path: Path) -> bool:
     """Whether a run has begun in a directory."""
     return (path / LISTING).exists() or (path / NEXT / LISTING).exists()
+
+
+def note_beginning(path: Path) -> None:
+    """Tell who asked that a run be resumed where none has begun: that of a batch job which was killed before."""
+    if not holds_run(path):
+        note(f"{path} holds no run yet; this one begins")
 
 
 def _opened(path: Path, mode: Mode) -> Path:
