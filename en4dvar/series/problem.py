@@ -107,7 +107,7 @@ class SeriesResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons not to trust the spread."""
-        told = [*self.of_members]
+        told = [*self.of_members, *too_few_at_start(self.problem)]
         size, (low, high) = scatter(self.normalised)
         missed, (_, most) = scatter(self.run.residuals)
         if missed > max(TOO_SURE, most):
@@ -169,6 +169,20 @@ def too_few(problem: SeriesProblem) -> Iterator[str]:
             f"{members} members are fewer than the {needed} that a window of {lag} times with model error "
             f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
             "give more members, or a shorter lag"
+        )
+
+
+def too_few_at_start(problem: SeriesProblem) -> Iterator[str]:
+    """Where members are fewer than what is uncertain at the start, and one more, and neither a localisation nor a model
+    error gives the analysis further directions. A twin experiment compares its spread with the truth instead.
+    """
+    settings, size = problem.settings, problem.start.drawn_size
+    whole = settings.scheme.cycled and not settings.scheme.resamples
+    if whole and settings.localisation is None and settings.model_error is None and problem.members <= size:
+        yield (
+            f"{problem.members} members are fewer than the {size + 1} that a state of {size} uncertain numbers needs: "
+            "what they do not span stays as wrong as it is at the start, unless the model itself forgets it, and the "
+            "spread may be far too small; give more members, or localisation"
         )
 
 

@@ -91,6 +91,24 @@ def test_a_square_root_says_how_many_members_it_needs(scheme):
     assert not [words for words in enough.warnings if "fewer" in words]
 
 
+@pytest.mark.parametrize("scheme", ["etkf", "ienks"])
+def test_a_state_says_how_many_members_it_needs(scheme):
+    """With as many mean and spread are those of the Kalman filter; with one fewer they are not, which is told."""
+    few, enough = (
+        en4dvar.estimate_sequence(
+            Still, {"a": (TIMES, READ)}, error={"a": 0.5}, initial_std=dict.fromkeys("abcd", 0.5),
+            assimilation={"scheme": scheme, "members": members},
+        )
+        for members in (4, 5)
+    )  # fmt: skip
+    assert enough.run.analysis.std[-1] == pytest.approx([0.5 / 3, 0.5, 0.5, 0.5], rel=1e-9)
+    assert enough.run.analysis.mean[-1, 0] == pytest.approx(READ.sum() / 9, rel=1e-9)
+    assert np.max(np.abs(few.run.analysis.std[-1] / enough.run.analysis.std[-1] - 1)) > 0.1
+    (told,) = few.warnings
+    assert told.startswith("4 members are fewer than the 5 that a state of 4 uncertain numbers needs")
+    assert enough.warnings == ()
+
+
 @pytest.mark.parametrize("count", [3, 8])
 def test_innovations_of_a_right_run_are_not_doubted_however_few_they_are(count):
     """Of a χ² of three to eight readings a root mean square of less than 2/3 is no wonder."""
