@@ -190,17 +190,18 @@ def test_windows_that_end_in_a_wrong_minimum_are_told():
     (path,) = Lorenz63.from_settings(Lorenz63.Settings()).trajectories(start, times)
     read = path.states[:, :3] + rng.standard_normal((48, 3))
 
-    def along(lag):
+    def along(lag, **keys):
         return en4dvar.estimate_sequence(
             "lorenz63", {name: (times, read[:, j]) for j, name in enumerate("xyz")}, {}, error=dict.fromkeys("xyz", 1),
             initial_std=dict.fromkeys("xyz", 1),
-            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag},
+            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag, **keys},
         )  # fmt: skip
 
     whole = along(48)
     assert np.sqrt(np.nanmean(whole.normalised**2)) < 1.2
     size = np.sqrt(np.mean((read - whole.run.analysis.mean[:, :3]) ** 2))
     assert size > 5
-    (told,) = whole.warnings
+    unsettled, told = whole.warnings
+    assert unsettled.startswith("1 of 1 cycle ended at max_iterations before they had settled, the worst at 12 with")
     assert told.startswith(f"residuals of the analyses are {size:.2g} times the errors: windows have ended in a wrong")
-    assert along(2).warnings == ()
+    assert along(2).warnings == along(2, max_iterations=1).warnings == ()
