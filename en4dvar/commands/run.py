@@ -118,12 +118,13 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
-    for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
+    held = populations_of(directory)
+    for n, (name, (_, of)) in enumerate(held.items()):
         from en4dvar.report.populations import group_lines
         from en4dvar.report.together import population_lines
 
         if name and n == 0:
-            echo("\n" + "\n".join(group_lines(directory)))
+            echo("\n" + "\n".join(group_lines(held)))
         echo("\n".join(["", *[name] * bool(name), *population_lines(of)]))
         warnings.add(f"the population of {name}" if name else "the population", of.cautions, whole=True)
 
