@@ -76,6 +76,11 @@ def test_every_way_of_reading_has_the_bits_of_the_function(way, folder):
         np.testing.assert_array_equal(path["y"], curve({"a": a, "b": b}, TIMES.tolist()))
 
 
+def test_only_what_has_times_of_its_own_is_interpolated(folder):
+    timed = {"y": {"column": "y", "time": "t"}, "z": {"column": "y"}}
+    assert model_of(folder, outputs=timed).interpolated == {"y"}
+
+
 def test_a_posterior_has_the_bits_of_the_function(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert fit(section()).posterior.identical(fit(curve).posterior)
