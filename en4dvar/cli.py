@@ -15,11 +15,12 @@ from typing import Any
 try:
     import click
 
-    from en4dvar.commands.common import Failed, give_up_output, printable, require_words, to_continue
+    from en4dvar.commands.common import Failed, give_up_output, printable, require_words, tell, to_continue
     from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
     from en4dvar.commands.results import compare, export, joint, population, report, rerun
     from en4dvar.commands.run import run, validate
     from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
+    from en4dvar.plumbing.called import typed
     from en4dvar.plumbing.errors import En4dvarError
     from en4dvar.plumbing.installed import installed
     from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
@@ -68,7 +69,7 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         output = _output()
         try:
-            with heeded(_end), terminate_as_interrupt():
+            with typed(tell), heeded(_end), terminate_as_interrupt():
                 value = super().invoke(ctx)
             sys.stdout.flush()
             if _output() != output:  # what was printed is nowhere, or in a file that has its number now

@@ -226,13 +226,10 @@ def to_continue(kept: object) -> Failed:
 
 
 @contextmanager
-def continuable(run_dir: Path | None = None, resume: bool = False) -> Iterator[str]:
+def continuable() -> Iterator[str]:
     """Within, an interrupt says what is kept of the run and what to type next; gives the command as typed."""
     from en4dvar.runs.interrupt import begun
-    from en4dvar.runs.rundir import holds_run
 
-    if run_dir is not None and resume and not holds_run(run_dir):  # of a batch job that was killed before it began
-        tell(f"note: {run_dir} holds no run yet; this one begins")
     try:
         yield command_line()
     except KeyboardInterrupt as interrupt:

@@ -274,7 +274,7 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
     ) -> None:  # fmt: skip
         how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell, "force": force, "resume": resume}
         folder = out or folder_of(kind, run_dirs)
-        with continuable(folder, resume):
+        with continuable():
             table, cautions, page = command(run_dirs, folder, how, **options)
         echo(table)
         for caution in cautions:

@@ -63,7 +63,7 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
         from en4dvar.runs.progress import terminal_progress
         from en4dvar.runs.runner import run_campaign
 
-        with continuable(config.directory, resume) as command, terminal_progress() as progress:
+        with continuable() as command, terminal_progress() as progress:
             campaign = run_campaign(
                 config, force=force, resume=resume, progress=progress, command=command,
                 report_workers=config.execution.workers or available_cores(),
@@ -118,12 +118,13 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
-    for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
+    held = populations_of(directory)
+    for n, (name, (_, of)) in enumerate(held.items()):
         from en4dvar.report.populations import group_lines
         from en4dvar.report.together import population_lines
 
         if name and n == 0:
-            echo("\n" + "\n".join(group_lines(directory)))
+            echo("\n" + "\n".join(group_lines(held)))
         echo("\n".join(["", *[name] * bool(name), *population_lines(of)]))
         warnings.add(f"the population of {name}" if name else "the population", of.cautions, whole=True)
 
@@ -187,7 +188,7 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     from en4dvar.runs.engine import conduct_run
     from en4dvar.runs.progress import counted
 
-    with continuable(config.directory, resume) as command, counted("cycles") as tell:
+    with continuable() as command, counted("cycles") as tell:
         kind = cycles_of(config, lambda cycle: tell(cycle + 1, kind.cycles) if tell else None)
         result = conduct_run(kind, force, resume, command)
     echo(result.table())

@@ -100,7 +100,7 @@ def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | N
     from en4dvar.runs.progress import counted
 
     how |= {"overrides": source.overrides(**{"execution.workers": workers}), "made_with": parted(made, "--made-with")}
-    with continuable(how["out"], how["resume"]) as command, counted("sets") as progress:
+    with continuable() as command, counted("sets") as progress:
         result = conduct(source.path, sets, progress=progress, command=command, **how)
     echo(str(result))
     for remark in result.remarks:
@@ -131,7 +131,7 @@ def design(source: Source, **how: Any) -> None:
     from en4dvar.runs.design_run import run_design
     from en4dvar.runs.progress import counted
 
-    with continuable(how["out"], how["resume"]) as command, counted("designs") as on_design:
+    with continuable() as command, counted("designs") as on_design:
         plan, directory = run_design(
             source.path, overrides=source.overrides(), on_design=on_design, on_cost=tell, command=command, **how
         )
@@ -171,7 +171,7 @@ def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) 
     if len(vary) < len(varied):
         raise click.UsageError("--vary: give all values of a key in one list")
     how |= {"overrides": source.overrides(), "progress": lambda done, of: tell(f"{done} of {of} runs")}
-    with continuable(how["out"], how["resume"]) as command:
+    with continuable() as command:
         result = sweep(source.path, vary, seeds, command=command, **how)
     echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):

@@ -125,6 +125,9 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         burn_in=twin.burn_in,
         error_correlation=correlation,
     )
+    if correlation is not None:
+        with document.placing():
+            _ = experiment.widths  # before anything is run
     return read.validated(TwinConfig, experiment=experiment, scheme=file.assimilation.scheme)
 
 

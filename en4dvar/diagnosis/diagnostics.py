@@ -123,7 +123,7 @@ def off(ensemble: Array, mean: Array, std: Array) -> tuple[float, float]:
     """How far members (N, n) are from this mean and standard deviation (n,): the largest distance of their mean in
     standard deviations, and the ratio of theirs to these where it is farthest from 1.
     """
-    ratio = ensemble.std(axis=0, ddof=1) / std
+    ratio = np.maximum(ensemble.std(axis=0, ddof=1) / std, np.finfo(float).tiny)  # of members that are all the same
     shift = np.max(np.abs(ensemble.mean(axis=0) - mean) / std)
     return float(shift), float(ratio[np.argmax(np.abs(np.log(ratio)))])
 

@@ -38,7 +38,7 @@ BLANK = ("", "nan", "na", "n/a", "#n/a", "-")
 MANY = 2000  # lines of a file whose cells are found once, whatever number of series it holds
 PREAMBLE = 200  # lines among which the names of the columns are looked for
 SEVERAL = 3  # lines of numbers that a table has at least, so that words below them are in its midst
-_SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
+_SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*[=:]\s*([-+.\deE]+)(?:\s+(\S.*))?")
 _BETWEEN_BLANKS = re.compile(r"\S+", re.ASCII)  # others stand within a cell, between thousands
 _BRACKETED = re.compile(r"\[.+\]|\(.+\)")
 _NAMELESS = re.compile(r"c[1-9]\d*")
@@ -51,9 +51,10 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def scalars_in(path: Path) -> dict[str, float]:
-    """What comments such as ``# Req = 21.79`` say, by name."""
+    """What comments such as ``# Req = 21.79`` say, by name; ``# delay: 7 us`` is ``delay_us``."""
     said = filter(None, (_SCALAR.fullmatch(line.strip()) for line in _text(path).splitlines()))
-    return {match[1]: float(match[2]) for match in said if is_number(match[2])}
+    stated = [match.groups() for match in said if is_number(match[2]) and is_unit(match[3] or "1")]
+    return {f"{name}_{unit}" if unit else name: float(number) for name, number, unit in stated}
 
 
 def _text(path: Path) -> str:

@@ -277,7 +277,8 @@ class ForwardModel(ABC):
 
     ``unforeseen`` are quantities that may change on the way by what no model foresees, by the standard deviation of
     the change of their logarithm; what is expected of readings after the window allows for one such change of each. If
-    one is no field of the state, :meth:`changed` says what its change is.
+    one is no field of the state, :meth:`changed` says what its change is. ``interpolated`` are observables that are
+    straight lines between outputs at times of the model's own.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -304,6 +305,7 @@ class ForwardModel(ABC):
     absent_parameters: Mapping[str, str] = MappingProxyType({})
     known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
+    interpolated: Collection[str] = ()
     _begins: float = 0.0  # on the clock of the paths, where ``trajectories`` begin
     _who: str = ""  # of whom messages about the paths speak, where not of ``trajectories``
 

@@ -90,7 +90,8 @@ _TOKEN = re.compile(
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
 
-def _symbol(name: str, like: str = "") -> Unit:
+def _symbol(token: re.Match[str], like: str) -> Unit:
+    name = token["symbol"]
     if name in UNPREFIXED:
         return UNPREFIXED[name]
     if name in PREFIXED:
@@ -98,21 +99,23 @@ def _symbol(name: str, like: str = "") -> Unit:
     if name[:1] in PREFIXES and name[1:] in PREFIXED:
         scale = Unit(Fraction(10) ** PREFIXES[name[0]], ONE.powers)
         return scale * PREFIXED[name[1:]]
-    raise UnitError(f"unknown unit {name!r}{_did_you_mean(name, like)}")
+    raise UnitError(f"unknown unit {name!r}{_did_you_mean(token, like)}")
 
 
-def _did_you_mean(name: str, like: str) -> str:
-    """The units that differ in capitals alone, which may be 10⁹ apart, else the nearest; none of another
-    dimension than ``like``, where this is known.
+def _did_you_mean(token: re.Match[str], like: str) -> str:
+    """The units that differ in capitals alone, which may be 10⁹ apart, else the nearest; none with which the whole
+    would have another dimension than ``like``, or the two nearest where this is not known.
     """
+    name, text = token["symbol"], token.string
     words = {"micron": "um", "sec": "s", "usec": "us", "msec": "ms", "hz": "Hz", "degC": "K", "C": "K", "percent": "%",
              "hour": "h", "hr": "h", "minute": "min", "second": "s", "a": "yr", "month": "d"}  # fmt: skip
     single = name.removesuffix("s")
     every = [*UNPREFIXED, *PREFIXED, *(p + u for p in PREFIXES for u in PREFIXED)]
-    known = [k for k in every if not like or _symbol(k).powers == parse_unit(like).powers]
+    wholes = {k: f"{text[: token.start('symbol')]}{k}{text[token.end('symbol') :]}" for k in every}
+    known = [k for k in every if not like or _powers(wholes[k]) == parse_unit(like).powers]
     same_letters = [k for k in known if k.lower() == name.lower()]
     word = [words[single]] if words.get(single) in known else []
-    close = word or same_letters or get_close_matches(name, known, 1, 0.6)
+    close = word or same_letters or get_close_matches(name, known, 1 if like else 2, 0.6)
     if not close:
         return f"; it has to be one such as {like!r}" if like not in ("", "1") else ""
     return f"; did you mean {' or '.join(map(repr, close))}?"
@@ -140,7 +143,7 @@ def parse_unit(text: str, like: str = "") -> Unit:
         multiple = re.fullmatch(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([A-Za-z%(].*)", clean)
         hint = f"; a multiple of a unit has a star: '{multiple[1]}*{multiple[2]}'" if multiple else ""
         raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}{hint}")
-    unit = _product(iter(tokens), text, like=like if len(tokens) == 1 else "")
+    unit = _product(iter(tokens), text, like)
     if not 1e-90 < unit.factor < 1e90:
         raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")
     return unit
@@ -148,10 +151,15 @@ def parse_unit(text: str, like: str = "") -> Unit:
 
 def is_unit(text: str) -> bool:
     """Whether :func:`parse_unit` reads it."""
+    return _powers(text) is not None
+
+
+def _powers(text: str) -> tuple[int | Fraction, ...] | None:
+    """The dimension of a unit; None of what is none."""
     try:
-        return bool(parse_unit(text))
+        return parse_unit(text).powers
     except UnitError:
-        return False
+        return None
 
 
 def unit_after(unit: str) -> str:
@@ -173,8 +181,8 @@ def as_unit(quantity: str, unit: str) -> str:
     return f"{number.lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
 
 
-def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "", like: str = "") -> Unit:
-    """Factors up to the ``closing`` bracket, or else the end."""
+def _product(tokens: Iterator[re.Match[str]], text: str, like: str, closing: str = "") -> Unit:
+    """Factors up to the ``closing`` bracket, or else the end; the whole ``text`` should be ``like`` another."""
     unit, operator, divided = ONE, "", False
     expects_factor, end = True, ""
     for token in tokens:
@@ -192,12 +200,12 @@ def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "", like
             if not expects_factor:
                 raise UnitError(f"cannot read unit {text!r}: a number stands before a unit")
         elif op == "(":
-            factor = _product(tokens, text, ")")
+            factor = _product(tokens, text, like, ")")
         else:
             power = token["power"] or "1"
             if len(power) > (7 if "." in power else 3) or abs(Fraction(power)) > LARGEST_POWER:
                 raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
-            factor = _symbol(token["symbol"], like if power == "1" else "") ** Fraction(power)
+            factor = _symbol(token, like) ** Fraction(power)
         if divided and operator != "/":
             raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
         divided = divided or operator == "/"

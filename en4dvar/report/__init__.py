@@ -26,7 +26,7 @@ from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.pack import PACK
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.results.together import JOINT, load_joint, populations_of
+from en4dvar.results.together import JOINT, StoredPopulation, load_joint, populations_of
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
@@ -102,19 +102,22 @@ def _write_campaign(
                 _write_page(*calls[i])
             elif isinstance(value, Exception):
                 raise value
-    of_gel = {name for _, of in populations_of(run_dir).values() for name in of.names}
+    held = populations_of(run_dir)
+    of_gel = {name for _, of in held.values() for name in of.names}
     figures = draw(overview_figures(sets, of_gel), folder=inside(run_dir, "figures") if files else None)
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
     shown = {"pages": pages, "failures": failures, "figures": figures}
-    return write_text(run_dir / "report.html", render_overview(sets, _headlines(run_dir), **shown))
+    return write_text(run_dir / "report.html", render_overview(sets, _headlines(run_dir, held), **shown))
 
 
-def _headlines(run_dir: Path) -> list[Headline]:
-    """What the data sets say together, where the run estimated it; the tables of its groups are written."""
+def _headlines(run_dir: Path, held: Mapping[str, tuple[Path, StoredPopulation]]) -> list[Headline]:
+    """What the data sets say together, where the run estimated it (``held`` its populations); the tables of its groups
+    are written.
+    """
     from en4dvar.report import populations, together  # with the estimates, which other pages do not need
 
     headlines: list[Headline] = []
-    groups = populations.groups_compared(run_dir)
+    groups = populations.groups_compared(held)
     if isinstance(groups, str):
         headlines.append(("summary.csv", "All data sets", [groups], [], ()))
     elif groups is not None:
@@ -122,7 +125,7 @@ def _headlines(run_dir: Path) -> list[Headline]:
         told = [*populations.group_sentences(groups, groups.symbols)]
         figures = [("populations", groups.caption, populations.figure(groups))]
         headlines.append(("differences.csv", "The differences", told, figures, ()))
-    for name, (folder, of) in populations_of(run_dir).items():
+    for name, (folder, of) in held.items():
         words = f"The population of {name}" if name else "The population of all data sets"
         told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of, of.symbols)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())

@@ -33,7 +33,7 @@ from en4dvar.report.paper import on_paper
 from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.results.together import load_groups_of
+from en4dvar.results.together import group_folders
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -309,7 +309,7 @@ def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path
 def _its_groups(runs: Any) -> str:
     """Where the comparison of the groups of one run is, and what it may be told; "" where it has none."""
     paths = [it for it in (runs if isinstance(runs, list | tuple) else [runs]) if isinstance(it, str | Path)]
-    groups = [shlex.quote(str(folder)) for path in paths for folder, _ in load_groups_of(Path(path)).values()]
+    groups = [shlex.quote(str(folder)) for path in paths for folder in group_folders(Path(path))]
     if len(groups) < 2:
         return ""
     return (

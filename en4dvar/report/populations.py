@@ -31,7 +31,7 @@ from en4dvar.report.paper import on_paper
 from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
 from en4dvar.results.declared import NAMES, Names
 from en4dvar.results.netcdf import understood
-from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
+from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_population
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,6 +125,13 @@ def compare_populations(
     what is known of no run or no parameter, or is no value with a standard deviation.
     """
     stored = {name: _stored(Path(run)) for name, run in named(runs).items()}
+    return _compared(stored, numbers, apart, seed, known)
+
+
+def _compared(
+    stored: Mapping[str, StoredPopulation], numbers: Sequence[float], apart: Sequence[str] = (), seed: int = 1,
+    known: Mapping[str, Mapping[str, str]] | None = None,
+) -> PopulationsCompared:  # fmt: skip
     names = [n for n in next(iter(stored.values())).names if all(n in s.names for s in stored.values())]
     if not names:
         raise OutputError("compare: the populations have no parameter in common")
@@ -284,7 +291,11 @@ def _stored(folder: Path) -> StoredPopulation:
             f"{folder}: holds no population; a run whose configuration has 'population:' ends with one, 'en4dvar "
             "population' makes one of finished runs"
         )
-    stored = load_population(path)
+    return _whole(path, load_population(path))
+
+
+def _whole(path: Path, stored: StoredPopulation) -> StoredPopulation:
+    """With everything that a comparison takes. Raises :class:`OutputError`."""
     with understood(path):
         if "/white" not in stored.groups:
             raise OutputError(f"{path}: written by an earlier version of en4dvar; make it again to compare it")
@@ -416,14 +427,16 @@ def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
     return (numbers, units.pop()) if len(set(numbers)) > 1 else ((), "")
 
 
-def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
-    """The groups of a run side by side; why not, where they share data; None with fewer than two populations."""
-    folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
-    if len(folders) < 2:
+def groups_compared(held: Mapping[str, tuple[Path, StoredPopulation]]) -> PopulationsCompared | str | None:
+    """The groups of a run side by side, of what :func:`~en4dvar.results.together.populations_of` gives; why not, where
+    they share data; None with fewer than two populations.
+    """
+    groups = {name: of_group for name, of_group in held.items() if name}
+    if len(groups) < 2:
         return None
-    numbers = numbers_of([*folders])[0] if len(folders) > 2 else ()  # a line through two is their difference
+    numbers = numbers_of([*groups])[0] if len(groups) > 2 else ()  # a line through two is their difference
     try:
-        return compare_populations(folders, numbers)
+        return _compared({name: _whole(folder / POPULATION, of) for name, (folder, of) in groups.items()}, numbers)
     except OutputError as error:
         return f"The groups are not compared: {error}."
 
@@ -435,9 +448,9 @@ def group_sentences(of: PopulationsCompared, names: Names = NAMES) -> Iterator[s
         yield f"The number of the straight line is that of the names of the groups, in {numbers_of(of.populations)[1]}."
 
 
-def group_lines(run_dir: Path) -> Iterator[str]:
-    """What the terminal shows of the groups of a run before each of them."""
-    of = groups_compared(run_dir)
+def group_lines(held: Mapping[str, tuple[Path, StoredPopulation]]) -> Iterator[str]:
+    """What the terminal shows of the groups of a run, as of :func:`groups_compared`, before each of them."""
+    of = groups_compared(held)
     if isinstance(of, str):
         yield of
     elif of is not None:

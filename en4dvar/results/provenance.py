@@ -26,6 +26,7 @@ import yaml
 from en4dvar.config.document import yaml_text
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.called import ELSEWHERE, advised
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest
 
@@ -147,7 +148,7 @@ class Identity:
         if earlier is not None and (difference := self.difference(earlier, retried)):
             raise OutputError(
                 f"{path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
-                "give --force to compute everything again, or another --out"
+                f"give {advised('--force')} to compute everything again, or {advised(*ELSEWHERE)}"
             )
 
 

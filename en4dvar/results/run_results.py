@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from en4dvar.plumbing.called import CONTINUED, advised
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import datasets_in
 from en4dvar.results.checkpoint import CheckpointError, read_checkpoint
@@ -91,7 +92,7 @@ class RunResults:
         if len(self.lacking) > MOST_NAMES:
             told.append(f"and {len(self.lacking) - MOST_NAMES} more")
         words = f"{self.run_dir}: no result that can be read of {', '.join(told)}"
-        hint = "'en4dvar run' with --resume estimates what is missing"
+        hint = f"{advised(*CONTINUED)} estimates what is missing"
         raise LackingError(f"{words}; {hint}", rest if self._read else None)
 
 

@@ -25,6 +25,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.summary import ParameterSummary, brief, results_table
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.called import CONTINUED, advised
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.hints import counted
 from en4dvar.plumbing.units import UnitError, convert
@@ -176,7 +177,7 @@ def require_settled(run_dir: Path) -> None:
     """Raise :class:`OutputError` where files of two runs may lie side by side."""
     if (run_dir / NEXT / COMPLETE).exists():
         words = "a run was killed while its files took the place of an earlier run's"
-        raise OutputError(f"{run_dir}: {words}; 'en4dvar run' with --resume finishes that")
+        raise OutputError(f"{run_dir}: {words}; {advised(*CONTINUED)} finishes that")
 
 
 def posterior_file(run_dir: str | Path) -> Path:

@@ -418,10 +418,14 @@ class StoredPopulation(StoredGroups):
 load_population = StoredPopulation.load
 
 
+def group_folders(run_dir: Path) -> list[Path]:
+    """The folders of the populations of groups of data sets, as configured."""
+    return sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{POPULATION}")), key=natural)
+
+
 def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
     """Group of data sets → the folder of its population, and this, as configured. Raises :class:`OutputError`."""
-    folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{POPULATION}")), key=natural)
-    stored = [(folder, load_population(folder / POPULATION)) for folder in folders]
+    stored = [(folder, load_population(folder / POPULATION)) for folder in group_folders(run_dir)]
     return {str(of.attributes.get("group", folder.name)): (folder, of) for folder, of in stored}
 
 

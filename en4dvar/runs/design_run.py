@@ -34,7 +34,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
 from en4dvar.results.run_results import has_results, result_files
-from en4dvar.results.together import POPULATION, load_groups_of
+from en4dvar.results.together import POPULATION, group_folders
 from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 
 STATE = f"{FOLDER}/designs"
@@ -266,7 +266,7 @@ def _members_of(after: Path) -> Path:
         return after
     if (after / POPULATION).exists():
         return after / POPULATION
-    if groups := [shlex.quote(str(folder)) for folder, _ in load_groups_of(after).values()]:
+    if groups := [shlex.quote(str(folder)) for folder in group_folders(after)]:
         raise ConfigError(f"--after {after}: several populations; give the folder of one of them: {' '.join(groups)}")
     if has_results(after) and (count := len(result_files(after))) > 1:
         raise ConfigError(

@@ -4,8 +4,6 @@ The engine does the rest, the same for every kind: it claims the directory and l
 answers interrupts, puts the result in place and writes the page. :mod:`en4dvar.results.kinds` lists the kinds.
 """
 
-import functools
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +16,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
 from en4dvar.inputs.parts import DataFile
+from en4dvar.plumbing.called import advised
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
@@ -226,30 +225,10 @@ def directory_mode(force: bool, resume: bool) -> Mode:
     return "force" if force else "resume" if resume else "new"
 
 
-_OPTIONS = (
-    (r"--(force|resume)\b", r"\1=True"),
-    (r"--out(?= .+ keeps both)", "the directory"),
-    (r"another --out\b", "another directory"),
-)
-
-
-@contextmanager
-def _advised_as_called(command: str) -> Iterator[None]:
-    """Where a function was called instead of a ``command``, an error advises its arguments in place of options."""
-    try:
-        yield
-    except En4dvarError as error:
-        if not re.match("en4dvar( |$)", command):
-            words = functools.reduce(lambda text, option: re.sub(option[0], option[1], text), _OPTIONS, str(error))
-            error.args = (words,)
-        raise
-
-
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
     """Conduct a run in its directory; arguments and errors as of :func:`en4dvar.run`."""
     names = (*kind.files, *kind.pages)
     with (
-        _advised_as_called(command),
         one_blas_thread(),
         terminate_as_interrupt(),
         # first: what follows may compile the model
@@ -326,6 +305,6 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
                 if isinstance(error, UnguardedError) or not run.begun:
                     raise
                 told = ExecutorError if isinstance(error, ExecutorError) else OutputError
-                advice = "; give --resume to continue" if directory.work.is_dir() else ""
+                advice = f"; give {advised('--resume')} to continue" if directory.work.is_dir() else ""
                 raise told(f"{error}; {kept()}{advice}") from error
         directory.publish()

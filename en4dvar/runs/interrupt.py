@@ -17,6 +17,7 @@ from typing import Any
 
 PATIENCE = 1.0  # s for the program to answer a signal by itself
 AGAIN = 0.05  # s; here and now it would be raised where nothing can be, once more
+_END = b"\0"  # number of no signal
 _answered = threading.Event()
 _kept: list[Callable[[], str]] = []  # what a stop has to say of the runs under way
 
@@ -94,7 +95,8 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
     come, written = os.pipe()
     if hasattr(os, "set_blocking"):
         os.set_blocking(written, False)
-    threading.Thread(target=_listen, args=(come, end), daemon=True).start()
+    listener = threading.Thread(target=_listen, args=(come, end), daemon=True)
+    listener.start()
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, interrupt)
     sys.unraisablehook, sys.excepthook = once_more, tell
@@ -104,14 +106,16 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
         sys.unraisablehook, sys.excepthook = tell_ignored, tell_error
         signal.signal(signal.SIGINT, handler)
         signal.set_wakeup_fd(before)
+        os.write(written, _END)  # a forked process may hold the pipe open
         os.close(written)
+        listener.join()  # or it would look for its answer when another command waits for one
 
 
 def _listen(come: int, end: Callable[[str], object]) -> None:
-    """Wait for signals, whose numbers are written into a pipe as they come, until it is closed."""
+    """Wait for signals, whose numbers are written into a pipe as they come, until its end is written."""
     stops = {getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")}
     with os.fdopen(come, "rb", buffering=0) as pipe:
-        while number := pipe.read(1):
+        while (number := pipe.read(1)) != _END:
             if number[0] in stops and not _answered.wait(PATIENCE):
                 words = ""
                 with suppress(Exception):  # it is asked while the run goes on

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from filelock import lock_descriptor
 
+from en4dvar.plumbing.called import ELSEWHERE, advised
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import POSIX, inside, is_gone, own_file
 
@@ -62,7 +63,7 @@ def _acquire(directory: Path) -> int:
             owner = os.read(file, _LONGEST).decode("utf-8", "replace").strip() or _OTHER
             os.close(file)
             if not _is_dead(owner) or time.monotonic() > patience:
-                advice = "wait for it to end, or give another --out"
+                advice = f"wait for it to end, or give {advised(*ELSEWHERE)}"
                 raise OutputError(f"{directory}: in use by {owner}; {advice}") from None
             time.sleep(0.02)
             continue

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.executor.processes import end_unguarded
+from en4dvar.plumbing.called import ELSEWHERE, advised, note
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, replace_file, write_text
 from en4dvar.results.kinds import KINDS, LISTING, kind_named, lines_of_list
@@ -65,6 +66,8 @@ class RunDirectory:
         end_unguarded()
         path = Path(path)
         home = path.absolute()
+        if mode == "resume":
+            note_beginning(path)
         if mode == "report" and not path.is_dir():
             raise OutputError(f"{path}: no such run directory")
         with ExitStack() as held:
@@ -84,7 +87,8 @@ class RunDirectory:
                 elif mode == "resume" and files and not {*files}.intersection(lines_of_list(work)):
                     for name in lines_of_list(work):
                         if not (name in OF_EVERY_RUN or "/" in name or BESIDE.fullmatch(name)):
-                            raise OutputError(f"{path}: holds {name} of another command; give another --out")
+                            words = f"holds {name} of another command; give {advised(*ELSEWHERE)}"
+                            raise OutputError(f"{path}: {words}")
             try:
                 yield directory
             except BaseException as error:
@@ -154,6 +158,12 @@ def holds_run(path: Path) -> bool:
     return (path / LISTING).exists() or (path / NEXT / LISTING).exists()
 
 
+def note_beginning(path: Path) -> None:
+    """Tell who asked that a run be resumed where none has begun: that of a batch job which was killed before."""
+    if not holds_run(path):
+        note(f"{path} holds no run yet; this one begins")
+
+
 def _opened(path: Path, mode: Mode) -> Path:
     """The folder of the run that is there, to write to. Raises :class:`OutputError`."""
     if mode in ("report", "beside"):
@@ -192,17 +202,18 @@ def _occupied(path: Path, listed: Sequence[str]) -> str:
     """What is in the directory, and what can be typed."""
     named = path if path.name not in ("", "..") else path.resolve()
     beside = next(p for i in itertools.count(2) if not (p := named.parent / f"{named.name or 'run'}_{i}").exists())
-    another = f"--out {shlex.quote(str(beside))} keeps both"
+    another = f"{advised('--out', 'the directory')} {shlex.quote(str(beside))} keeps both"
+    force = f"{advised('--force')} replaces it, {another}"
     if not listed:
         return f"{path}: not empty, and not of a run; {another}"
     held = [path / name for name in listed if "/" not in name and (path / name).is_file()]
     ends = [kind_named(name).result for name in KINDS]  # each written as a run ends
     ended = [file.stat().st_mtime for file in held if file.suffix == ".nc" or file.name in ends]
     if not ended or (path / NEXT / LISTING).exists():
-        return f"{path}: not empty: a run; --resume continues it if it has not ended, --force replaces it, {another}"
+        return f"{path}: not empty: a run; {advised('--resume')} continues it if it has not ended, {force}"
     when = datetime.fromtimestamp(max(ended)).strftime("%Y-%m-%d %H:%M")
     to_read = next((f", see {file}" for file in held if file.suffix == ".html"), "")
-    return f"{path}: not empty: a finished run of {when}{to_read}; --force replaces it, {another}"
+    return f"{path}: not empty: a finished run of {when}{to_read}; {force}"
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -14,7 +14,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
-from en4dvar.results.together import GROUPS, load_groups_of
+from en4dvar.results.together import GROUPS, group_folders
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.checks import checked_problem, require_together
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
@@ -166,7 +166,7 @@ class EstimateKind(RunKind[Campaign]):
         for kind in (JointKind, PopulationKind):
             if (folder / kind.result).exists():
                 kind.page(folder)
-        for of_group, _ in load_groups_of(folder).values():
+        for of_group in group_folders(folder):
             PopulationKind.page(of_group)
         return write_pages(folder, datasets, workers, figures)
 

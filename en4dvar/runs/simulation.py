@@ -30,6 +30,7 @@ from en4dvar.inputs.formats import TRUTHS
 from en4dvar.inputs.parts import Column
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of, read_along
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SCALE, TIME_SHIFT, Array, floats
+from en4dvar.plumbing.called import advised
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import beside, counted, listed
@@ -277,7 +278,7 @@ def write_campaign(
     """One CSV file a data set and ``truth.csv``, which no estimation reads. Raises :class:`OutputError`."""
     files = [folder / f"{s.name}.csv" for s in sets] + [folder / TRUTH]
     if not force and (there := [file for file in files if file.exists()]):
-        raise OutputError(f"{there[0]}: exists; give --force to replace it")
+        raise OutputError(f"{there[0]}: exists; give {advised('--force')} to replace it")
     make_folder(folder)
     for file, dataset in zip(files, sets, strict=False):
         write_text(file, _data_csv(plan, dataset, command))

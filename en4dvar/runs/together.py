@@ -37,7 +37,7 @@ from en4dvar.results.store import load_stored
 from en4dvar.runs.engine import Kind, Session, directory_mode
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
-from en4dvar.runs.rundir import RunDirectory
+from en4dvar.runs.rundir import RunDirectory, note_beginning
 from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
 
@@ -92,6 +92,8 @@ class TogetherKind(Kind, ABC):
         it is damaged, or a file that no run wrote would be replaced. Others as of :meth:`estimate`.
         """
         names, record, mode = (*self.files, *self.pages), self.records[0], directory_mode(force, resume)
+        if mode == "resume":
+            note_beginning(out)
         with terminate_as_interrupt(), RunDirectory.open(out, "beside", names) as directory:
             config, sets = finished(run_dirs, trust, ask)
             attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}

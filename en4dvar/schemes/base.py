@@ -223,6 +223,12 @@ class Scheme:
         """
         return iteration + 1 == self.passes
 
+    def left(self, step: Step | GaussNewtonStep) -> float:
+        """How long the step was, in posterior standard deviations, behind which a limit has ended the iterations of a
+        cycle; 0 where they were done.
+        """
+        return 0.0
+
 
 @dataclass(frozen=True)
 class Minimiser(Scheme):

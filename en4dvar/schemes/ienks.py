@@ -81,3 +81,7 @@ class IEnKS(Scheme):
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         return step.norm <= self.tolerance or iteration + 1 == self.max_iterations
+
+    def left(self, step: Step | GaussNewtonStep) -> float:
+        """A limit of one iteration is asked for as such: it makes filters and smoothers without iterations."""
+        return step.norm if step.norm > self.tolerance and self.max_iterations > 1 else 0.0

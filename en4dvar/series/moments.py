@@ -155,14 +155,15 @@ class SequentialState:
 
     The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
     ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): place of the observation
-    among the members with errors of the observations, 0 to 1, NaN where there was none. ``evidence`` (K,): log
-    density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
-    ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
-    leave, NaN: all. ``members`` (N', n + changes of what varies) at the ``start`` of the window (0: time zero, k:
-    observation time k); ``kept``: index of a time → analysis members (N', n), physical; ``failures`` the reasons of the
-    members lost. ``bystanders`` (N', m): constants that nothing depends on, N(0, 1) at the start, as the analyses of a
-    scheme that perturbs have left them; (N', 0) of another. ``residuals`` (K, p): observations less the predictions of
-    the analysis, over their errors; NaN of a filter.
+    among the members with errors of the observations, 0 to 1, NaN where there was none. ``evidence`` (K,): log density
+    of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
+    ``iterations`` (K,) forecasts of the window; ``left`` (K,) the length of the step that a limit made their last, in
+    posterior standard deviations, 0 where they were done. ``effective`` (K,): members that the weights of a particle
+    filter leave, NaN: all. ``members`` (N', n + changes of what varies) at the ``start`` of the window (0: time zero,
+    k: observation time k); ``kept``: index of a time → analysis members (N', n), physical; ``failures`` the reasons of
+    the members lost. ``bystanders`` (N', m): constants that nothing depends on, N(0, 1) at the start, as the analyses
+    of a scheme that perturbs have left them; (N', 0) of another. ``residuals`` (K, p): observations less the
+    predictions of the analysis, over their errors; NaN of a filter.
 
     The rest of a run depends on its arguments and these alone: ``cycle`` observation times are done; ``trail`` is what
     a smoother keeps, ``covariances`` are averages, (n, p) and (p, p), both empty of a run that has ended. Random
@@ -187,6 +188,7 @@ class SequentialState:
     covariances: tuple[Array, ...] = ()
     bystanders: Array = field(default_factory=lambda: np.empty((0, 0)))
     residuals: Array = field(default_factory=lambda: np.empty((0, 0)))
+    left: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def ensemble(self) -> Array:

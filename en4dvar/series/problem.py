@@ -12,6 +12,8 @@ from en4dvar.diagnosis.diagnostics import chi2_interval, common_reasons
 from en4dvar.executor import Executor
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import Array
+from en4dvar.plumbing.hints import counted
+from en4dvar.plumbing.units import unit_after
 from en4dvar.series.moments import SequentialState
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries, aligned
@@ -19,6 +21,7 @@ from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
 
 TOO_SURE, TOO_WIDE = 1.2, 1 / 1.5  # root mean square of normalised innovations that is told, beyond chance
+LEFT, OFTEN = 0.5, 0.01  # step, in standard deviations, that a limit made the last, and share of cycles, that are told
 CHANCE = 3.0  # error over spread of a constant that nothing depends on, that is told
 
 
@@ -107,7 +110,7 @@ class SeriesResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons not to trust the spread."""
-        told = [*self.of_members]
+        told = [*self.of_members, *too_few_at_start(self.problem)]
         size, (low, high) = scatter(self.normalised)
         missed, (_, most) = scatter(self.run.residuals)
         if missed > max(TOO_SURE, most):
@@ -130,6 +133,7 @@ class SeriesResult:
         yield from members_lost(self.run, self.problem.members)
         yield from too_few(self.problem)
         yield from narrowed(self.problem, self.run)
+        yield from unsettled(self.problem, self.run)
 
 
 def scatter(normalised: Array) -> tuple[float, Array]:
@@ -169,6 +173,32 @@ def too_few(problem: SeriesProblem) -> Iterator[str]:
             f"{members} members are fewer than the {needed} that a window of {lag} times with model error "
             f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
             "give more members, or a shorter lag"
+        )
+
+
+def too_few_at_start(problem: SeriesProblem) -> Iterator[str]:
+    """Where members are fewer than what is uncertain at the start, and one more, and neither a localisation nor a model
+    error gives the analysis further directions. A twin experiment compares its spread with the truth instead.
+    """
+    settings, size = problem.settings, problem.start.drawn_size
+    whole = settings.scheme.cycled and not settings.scheme.resamples
+    if whole and settings.localisation is None and settings.model_error is None and problem.members <= size:
+        yield (
+            f"{problem.members} members are fewer than the {size + 1} that a state of {size} uncertain numbers needs: "
+            "what they do not span stays as wrong as it is at the start, unless the model itself forgets it, and the "
+            "spread may be far too small; give more members, or localisation"
+        )
+
+
+def unsettled(problem: SeriesProblem, run: SequentialState) -> Iterator[str]:
+    """Where cycles ended at the limit of iterations, far from where they would have."""
+    count, cycles, worst = int(np.sum(run.left > LEFT)), int(np.sum(run.iterations > 0)), int(np.argmax(run.left))
+    if count > OFTEN * cycles:
+        yield (
+            f"{count} of {counted(cycles, 'cycle')} ended at max_iterations before they had settled, the worst at "
+            f"{problem.series.times[worst]:.6g}{unit_after(problem.start.model.time_unit)} with a last step of "
+            f"{run.left[worst]:.2g} posterior standard deviations; give a larger max_iterations or, where steps go to "
+            "and fro, mda_weights, or a shorter lag"
         )
 
 

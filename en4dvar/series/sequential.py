@@ -102,7 +102,7 @@ class _Run:
         self.initial_members, size = members.shape
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         cycles = len(series.times)
-        self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.iterations, self.effective, self.left = np.zeros(cycles), np.full(cycles, np.nan), np.zeros(cycles)
         self.residuals = np.full(series.values.shape, np.nan)
         self.trail: list[Array] = []
         self.bystanders = np.empty((len(members), 0))
@@ -122,6 +122,7 @@ class _Run:
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
             self.bystanders, self.residuals[: resume.cycle] = resume.bystanders, resume.residuals
+            self.left[: resume.cycle] = resume.left
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.predicted = InnovationRecorder(series, truth is None, resume)
@@ -135,7 +136,7 @@ class _Run:
             before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
             self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
             self.start, tuple(self.trail), self.covariances, self.bystanders,
-            self.residuals[:done].copy(),
+            self.residuals[:done].copy(), self.left[:done].copy(),
         )  # fmt: skip
 
     def result(self) -> SequentialState:
@@ -153,6 +154,7 @@ class _Run:
         forecasts = [each[rows] for each in forecasts]
         members = forecasts[-1]
         self.iterations[newest - 1] = descent.iteration
+        self.left[newest - 1] = self.scheme.left(descent.step)
         self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
         mean, anomalies = window.posterior(descent)
         if self.scheme.climatological and window.localised is None:

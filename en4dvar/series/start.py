@@ -80,6 +80,12 @@ class InitialEnsemble:
     fixed: Mapping[str, float] = field(default_factory=dict)
     coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
 
+    @property
+    def drawn_size(self) -> int:
+        """How many numbers of a member are drawn, of the prior and of the state."""
+        free = sum(field.size for field in self.model.layout if self.initial_std.get(field.name, 0.0) > 0)
+        return free + len(self.prior.terms if self.prior else ())
+
     def members(self, n_members: int, seed: int, exact: bool = False) -> Array:
         """(N, n_state) in the ensemble's coordinates, each from its own stream.
 
@@ -94,7 +100,7 @@ class InitialEnsemble:
         of_prior = np.array([stream.standard_normal(len(prior.terms)) for stream in streams])
         of_state = np.array([stream.standard_normal(model.layout.size) for stream in streams])
         free, m = std > 0, len(prior.terms)
-        if exact and n > m + free.sum():
+        if exact and n > self.drawn_size:
             whole = whiten_sample(np.hstack([of_prior, of_state[:, free]]))
             of_prior, of_state[:, free] = whole[:, :m], whole[:, m:]
         x = prior.from_white(of_prior)

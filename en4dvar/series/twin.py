@@ -59,6 +59,19 @@ class TwinExperiment:
         return tuple(o for o in self.model.observables if o.name in self.error_std)
 
     @property
+    def widths(self) -> list[int]:
+        """How many numbers each observable is at an instant, by the state at time zero. Raises :class:`En4dvarError`:
+        there is none. :class:`ConfigError`: the correlation of the errors is not that of so many.
+        """
+        state = self.start.coordinates.to_physical(self.start.drawn([member_stream(0, "truth")]))
+        outcome = Trajectory(np.zeros(1), state, self.model.layout)
+        widths = [predictions([o], outcome).shape[1] for o in self.observables]
+        if self.error_correlation is not None:
+            with retold(ValueError, ConfigError, "", "twin.error_correlation"):
+                self.error_correlation.check_size(sum(widths))
+        return widths
+
+    @property
     def dynamic(self) -> Array:
         """(n_state,) bool: the variables that are not parameters."""
         constant = {p.name for p in self.model.parameters}
@@ -138,16 +151,12 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSe
 
     Raises En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
     """
-    model, times = experiment.model, experiment.times
+    times, widths = experiment.times, experiment.widths
     states = _truth(experiment, seed)
-    outcome = Trajectory(times, states, model.layout)
-    exact = predictions(experiment.observables, outcome)
-    widths = [predictions([o], outcome).shape[1] for o in experiment.observables]
+    exact = predictions(experiment.observables, Trajectory(times, states, experiment.model.layout))
     std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
     noise = member_stream(seed, "observation error").standard_normal(exact.shape)
     if experiment.error_correlation is not None:
-        with retold(ValueError, ConfigError, "twin.error_correlation: "):
-            experiment.error_correlation.check_size(len(std))
         noise = experiment.error_correlation.correlated(noise)
     each = zip(experiment.observables, widths, strict=True)
     names = [f"{o.name}_{j}" if width > 1 else o.name for o, width in each for j in range(width)]

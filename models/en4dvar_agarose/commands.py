@@ -68,7 +68,7 @@ def sweep(
     who = identity_of(loaded[0].seed, chosen, {f"{i} {config.name}": config for i, config in enumerate(loaded, 1)})
     files = "sweep.csv", "checkpoints/*", "checkpoints/sweep/*"
     with (
-        continuable(folder, resume),
+        continuable(),
         StudyCheckpoints.open(folder, force, resume, who, files) as keep,
         counted("trajectories") as progress,
         choose_executor(problems[0].model, workers=workers) as executor,
@@ -108,7 +108,7 @@ def study(
     plan = load_study(config, Source(Path(config), None, settings).overrides())
     folder = out or Path("runs") / plan.name
     who = identity_of(plan.seed, plan.sweep, plan.named)
-    with continuable(folder, resume), StudyCheckpoints.open(folder, force, resume, who, FILES) as keep:
+    with continuable(), StudyCheckpoints.open(folder, force, resume, who, FILES) as keep:
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, keep.directory.work)
     for gel, comparison in result.comparisons.items():

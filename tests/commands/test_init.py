@@ -226,7 +226,7 @@ def test_without_data_a_starter_is_written() -> None:
 
 
 def test_names_are_quoted_where_yaml_needs_it() -> None:
-    for text in ("R (um)", "1", "no", "a: b", "#", "t,s", "Größe", "R_um", "a b"):
+    for text in ("R (um)", "1", "no", "a: b", "#", "t,s", "Größe", "R_um", "a b", ".5", ".inf", "..."):
         assert parse_document(f"x: {{name: {quoted(text)}, unit: m}}").data == {"x": {"name": text, "unit": "m"}}
 
 

@@ -184,12 +184,18 @@ def test_validate(tmp_path):
             "error_correlation: c.csv",
             r"twin\.yaml:6:\d+: twin\.error_correlation: .*c\.csv: no such file",
         ),
+        (
+            "burn_in: 10",
+            "error_correlation: two.csv",
+            r"twin\.yaml:6:\d+: twin\.error_correlation: correlation \(2, 2\) does not match 12 observations",
+        ),
         ("seed: 4", "sed: 4", r"twin\.yaml:2:1: sed: unknown key 'sed'; did you mean 'seed'"),
         ("seed: 4", "parameters: {F: {from_file: F, unit: '1'}}", r"parameters\.F: a twin experiment has no data file"),
     ],
 )
 def test_faults_are_located(tmp_path, old, new, message):
     path = write(tmp_path, (old, new))
+    (tmp_path / "two.csv").write_text("1,0.5\n0.5,1\n")
     with pytest.raises(ConfigError, match=message):
         load_twin(path)
     outcome = call("validate", path)

@@ -40,6 +40,17 @@ class Violent(Vectorised):
     validity = (ValidityLimit("y", 0.9, "m", "largest excursion", "a test"),)
 
 
+class Coarse(Linear):
+    """With outputs 0.6 s apart, and straight lines between them."""
+
+    interpolated = ("y",)
+
+    def curve(self, theta, t):
+        before = 0.6 * np.floor(t / 0.6)
+        y, after = super().curve(theta, before), super().curve(theta, before + 0.6)
+        return y + (t - before) / 0.6 * (after - y)
+
+
 class Doubtful(Vectorised):
     """Does not believe a reading that no prior member comes near."""
 
@@ -204,6 +215,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
     "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),
     "implausible-data": lambda: run(make_problem(Doubtful(TWO), (1.0, 0.5))),
+    "coarse-outputs": lambda: run(make_problem(Coarse(TWO), (1.0, 1.5), k=40, std=0.04)),
     "model-validity": lambda: run(make_problem(Violent(TWO), (1.0, 0.5))),
     "members-lost": lambda: run(
         make_problem(Fragile(0.2, names=TWO), (-1.0, 0.5)), members=40, min_active_fraction=0.2

@@ -173,6 +173,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "implausible-data": linear,  # the units were wrong
     "future-missed": lambda: turned(20),
     "missed-knots": lambda: ramp((2.0,)),
+    "coarse-outputs": lambda: make_problem(Vectorised(TWO), (1.0, 1.5), k=40, std=0.04),  # a model with more of them
     "lost-frame": filmed,  # the times were corrected
     "model-validity": linear,  # a model without that limit
     "members-lost": narrow,

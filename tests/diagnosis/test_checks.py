@@ -12,6 +12,7 @@ from toys import Fragile, Vectorised, make_problem
 
 import en4dvar
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import off
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, missed, rank, validity, where_lost
 from en4dvar.diagnosis.honesty.examine import collapse, doubts
@@ -317,3 +318,11 @@ def test_a_discrepancy_is_measured_by_the_errors_of_the_readings_not_by_what_it_
     low = np.quantile(analysis.posterior[:, 2], 0.05)
     for times, count in ((3.9, 1), (4.1, 0)):
         assert len([*missed(replace(analysis, own_std=np.full(40, times * low)))]) == count
+
+
+def test_members_that_are_all_the_same_are_far_from_any_spread():
+    """The inverse of the ratio, which results hold where it is larger, was a division by zero."""
+    shift, ratio = off(np.full((5, 2), 3.0), np.array([1.0, 3.0]), np.array([0.5, 1.0]))
+    assert shift == 4
+    assert 0 < ratio < 1e-300
+    assert np.isfinite(1 / ratio)

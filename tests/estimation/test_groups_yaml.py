@@ -17,6 +17,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report import populations
 from en4dvar.report.populations import compare_populations, numbers_of
+from en4dvar.results import together
 from en4dvar.results.together import load_groups_of, load_population
 from en4dvar.runs.checks import validate
 from en4dvar.runs.engine import write_report
@@ -75,7 +76,7 @@ def test_each_group_is_the_population_of_its_data_sets_alone(finished, tmp_path)
 
 
 @pytest.mark.slow
-def test_terminal_and_page_open_with_the_comparison(finished):
+def test_terminal_and_page_open_with_the_comparison(finished, monkeypatch):
     run, output = finished
     folders = {name: folder for name, (folder, _) in load_groups_of(run).items()}
     of = compare_populations(folders, (5.0, 8.0))
@@ -95,17 +96,21 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     assert (run / "differences.csv").is_file()
     listed = (run / ".en4dvar-files").read_text().splitlines()
     assert "groups/2_gel_8kPa/population.nc" in listed
+    read, load = [], together.load_population
+    monkeypatch.setattr(together, "load_population", lambda path: read.append(path) or load(path))
+    monkeypatch.setattr(populations, "load_population", together.load_population)
     write_report(run)
     assert (run / "report.html").read_text() == page
+    assert len(read) == 2  # each of them once
 
 
 @pytest.mark.parametrize(
     ("names", "numbers"), [(["5 %", "8 %"], ()), (["5 %", "8 %", "10 %"], (5.0, 8.0, 10.0)), (["5 %", "8 %", "x"], ())]
 )
 def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
-    monkeypatch.setattr(populations, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
-    monkeypatch.setattr(populations, "compare_populations", lambda folders, asked: asked)
-    assert populations.groups_compared(tmp_path) == numbers
+    monkeypatch.setattr(populations, "_whole", lambda path, of: of)
+    monkeypatch.setattr(populations, "_compared", lambda groups, asked: asked)
+    assert populations.groups_compared({name: (tmp_path / name, None) for name in (*names, "")}) == numbers
 
 
 def test_what_a_known_group_does_to_the_others_is_told():

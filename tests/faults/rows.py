@@ -30,11 +30,17 @@ class Row:
 
     def told(self, text: str) -> bool:
         """Whether ``text`` holds the message, as the command line or a function tells it."""
-        text = text.replace("give resume=True", "give --resume")
+        for argument, option in AS_TYPED.items():
+            text = text.replace(argument, option)
         parts = (re.escape(part) for part in re.split(r"\{[^}]*\}", self.message))
         return re.search(".*".join(parts), text) is not None
 
 
+AS_TYPED = {
+    "the run with resume=True": "'en4dvar run' with --resume",
+    "give resume=True": "give --resume",
+    "give another directory": "give another --out",
+}
 DONE = "every finished data set; the others continue from their last forward runs"
 ROWS = tuple(
     Row(*cells)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -19,6 +20,7 @@ from run_files import assert_same_results, command, configuration, environment, 
 
 from en4dvar.cli import Commands, main
 from en4dvar.results.run_results import result_files
+from en4dvar.runs import interrupt
 from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 
@@ -232,6 +234,22 @@ def test_a_stop_where_nothing_can_be_raised_is_raised_behind_it(number):
             _end_and_wait(number)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_stop_that_was_answered_ends_no_later_command(monkeypatch):
+    """Of two commands in one process the second did, where the thread that waits for signals came late to see it."""
+    ended, listen = [], interrupt._listen
+    monkeypatch.setattr(interrupt, "PATIENCE", 0.05)
+    monkeypatch.setattr(interrupt, "_listen", lambda *of: (time.sleep(0.1), listen(*of)))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with suppress(KeyboardInterrupt), heeded(ended.append):
+            signal.raise_signal(signal.SIGINT)
+        with heeded(ended.append):
+            time.sleep(0.2)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not ended
 
 
 def test_compiled_code_that_ignores_a_stop_prints_no_traceback(capfd):

@@ -174,9 +174,12 @@ def test_mat_layouts(tmp_path: Path, shape: tuple[int, int]) -> None:
 
 def test_scalars_in_the_comments_of_a_table(tmp_path):
     head = "# Req = 21.79\n# en4dvar track = x\n# a = b: 3\n# deltat=-1.5e-6 \n# e = .\nt,R\n# late = 3\n"
+    head = f"# h: 750\n% delay = 7.0 us\n# rate:2.7e5 1/s\n# G = 3 Pa; mu = 2\n# n = 4 bubbles\n{head}"
     (tmp_path / "a.csv").write_text(head + "1,2\n2,3\n3,1\n")
     series = read_series(tmp_path / "a.csv", Column("t", "us", "s"), Column("R", "um", "m"))
-    assert series.scalars == {"Req": 21.79, "deltat": -1.5e-6, "late": 3}
+    assert series.scalars == {
+        "h": 750, "delay_us": 7, "rate_1/s": 2.7e5, "Req": 21.79, "deltat": -1.5e-6, "late": 3,
+    }  # fmt: skip
     assert read_contents(tmp_path / "a.csv").scalars == series.scalars
 
 

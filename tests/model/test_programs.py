@@ -76,6 +76,11 @@ def test_every_way_of_reading_has_the_bits_of_the_function(way, folder):
         np.testing.assert_array_equal(path["y"], curve({"a": a, "b": b}, TIMES.tolist()))
 
 
+def test_only_what_has_times_of_its_own_is_interpolated(folder):
+    timed = {"y": {"column": "y", "time": "t"}, "z": {"column": "y"}}
+    assert model_of(folder, outputs=timed).interpolated == {"y"}
+
+
 def test_a_posterior_has_the_bits_of_the_function(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert fit(section()).posterior.identical(fit(curve).posterior)
@@ -103,7 +108,7 @@ def test_parameters_may_be_arguments_and_the_program_a_shell_line(folder):
 def test_no_shell_unless_asked_for(folder):
     model = model_of(
         folder,
-        command="echo {a} ; touch nowhere",
+        command="echo {a} ';' touch nowhere",
         templates=(),
         outputs={"y": {"file": "stdout", "pattern": r"(\S+)$"}},
     )
@@ -258,6 +263,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "limit unit": ({"time_limit": 3}, "model.time_limit: 3 has no unit; write e.g. '3 s'"),
     "retries": ({"retries": -1}, "model.retries: should be greater than or equal to 0"),
     "shell": ({"shell": "perhaps"}, "model.shell: "),
+    "no shell": ({"command": "'./a && b' > {output}"}, "the program would get > as an argument; write shell: true"),
     "scratch": ({"scratch": "nowhere"}, "nowhere: no such folder"),
     "key": ({"comand": "x"}, "model.comand: unknown key 'comand'; did you mean 'command'?"),
 }

@@ -65,6 +65,8 @@ def test_quantity(text: str, unit: str, value: float) -> None:
         ("3 pas", "Pa s", "unknown unit 'pas'; it has to be one such as 'Pa s'"),
         ("3 C", "m", "unknown unit 'C'; it has to be one such as 'm'"),
         ("2 sec", "s", "did you mean 's'"),
+        ("2/mim", "1/s", r"unknown unit 'mim'; did you mean 'min'\?"),
+        ("2 kg/(mm ss)", "kg/(m s^2)", "unknown unit 'ss'; it has to be one such as"),
         ("2 days", "d", "did you mean 'day'"),
         ("2 hours", "h", "did you mean 'h'"),
         ("2 months", "d", "did you mean 'd'"),

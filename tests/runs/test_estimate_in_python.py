@@ -192,7 +192,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         "priors.a.mean: 0 has no unit; write e.g. '0 m'",
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
-    "unit unknown": ({"units": {"a": "1/mim"}}, "units: a: unknown unit 'mim'; did you mean"),
+    "unit unknown": ({"units": {"a": "1/mim"}}, "units: a: unknown unit 'mim'; did you mean 'mm' or 'min'?"),
     "units in a list": ({"units": ["a"]}, "units: give a dict, e.g. {'k': '1/s'}"),
     "number of a column": ({"observable": 1}, "observable: 1 is no name of a column; give a text, or a list of them"),
     "infinite": ({"data": (TIMES, np.where(TIMES > 2.9, np.inf, VALUES))}, "reading 12 of data: inf in column 'y'"),
@@ -382,6 +382,8 @@ def test_a_warning_shows_a_time_without_a_unit_as_a_number():
 
 
 def test_a_directory_that_is_not_empty_is_told_in_arguments_of_the_function(tmp_path):
-    fit(directory=tmp_path / "a")
-    with pytest.raises(en4dvar.OutputError, match=r"; force=True replaces it, the directory \S+a_2 keeps both$"):
-        fit(directory=tmp_path / "a")
+    """In its name ``--force`` was written as ``force=True``."""
+    fit(directory=tmp_path / "a--force")
+    words = r"a--force: .+; force=True replaces it, the directory \S+a--force_2 keeps both$"
+    with pytest.raises(en4dvar.OutputError, match=words):
+        fit(directory=tmp_path / "a--force")

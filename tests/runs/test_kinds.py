@@ -110,6 +110,18 @@ def test_what_is_written_is_declared(
         assert set(contents(out)) - {LISTING} == written
 
 
+@pytest.mark.parametrize("name", ["estimate", "design", "sweep-twin", "calibrate"])
+def test_a_resumed_run_that_begins_is_told_without_out_as_with_it(
+    prepared: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def full(path: Path, mode: str) -> Path:
+        raise OutputError(f"{path}: full")
+
+    monkeypatch.setattr("en4dvar.runs.rundir._prepare", full)
+    told = call(prepared, *WORKED[name], "--resume").stderr
+    assert re.fullmatch(r"note: (\S+) holds no run yet; this one begins\n\1: full\n", told), told
+
+
 READ = {"rerun": (), "export": (), "compare": ("again",), "joint": (), "population": ("--of", "k")}
 
 

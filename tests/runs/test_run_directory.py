@@ -247,7 +247,7 @@ def test_a_directory_is_named_as_it_was_given(tmp_path, monkeypatch, mode):
     monkeypatch.chdir(tmp_path)
     Path("out").mkdir()
     Path("out/mine.txt").touch()
-    words = "not empty, and not of a run; --out out_2 keeps both" if mode == "new" else "holds no run"
+    words = "not empty, and not of a run; the directory out_2 keeps both" if mode == "new" else "holds no run"
     with pytest.raises(OutputError, match=f"^out: {words}$"), RunDirectory.open("out", mode):
         pass
 

@@ -27,6 +27,7 @@ def test_signature_of_a_scheme():
         "linearise": ("weights", "runs"),
         "advance": ("weights", "evaluation", "iteration", "draw"),
         "done": ("iteration", "step"),
+        "left": ("step",),
     }
 
 

@@ -91,6 +91,24 @@ def test_a_square_root_says_how_many_members_it_needs(scheme):
     assert not [words for words in enough.warnings if "fewer" in words]
 
 
+@pytest.mark.parametrize("scheme", ["etkf", "ienks"])
+def test_a_state_says_how_many_members_it_needs(scheme):
+    """With as many mean and spread are those of the Kalman filter; with one fewer they are not, which is told."""
+    few, enough = (
+        en4dvar.estimate_sequence(
+            Still, {"a": (TIMES, READ)}, error={"a": 0.5}, initial_std=dict.fromkeys("abcd", 0.5),
+            assimilation={"scheme": scheme, "members": members},
+        )
+        for members in (4, 5)
+    )  # fmt: skip
+    assert enough.run.analysis.std[-1] == pytest.approx([0.5 / 3, 0.5, 0.5, 0.5], rel=1e-9)
+    assert enough.run.analysis.mean[-1, 0] == pytest.approx(READ.sum() / 9, rel=1e-9)
+    assert np.max(np.abs(few.run.analysis.std[-1] / enough.run.analysis.std[-1] - 1)) > 0.1
+    (told,) = few.warnings
+    assert told.startswith("4 members are fewer than the 5 that a state of 4 uncertain numbers needs")
+    assert enough.warnings == ()
+
+
 @pytest.mark.parametrize("count", [3, 8])
 def test_innovations_of_a_right_run_are_not_doubted_however_few_they_are(count):
     """Of a χ² of three to eight readings a root mean square of less than 2/3 is no wonder."""
@@ -172,17 +190,18 @@ def test_windows_that_end_in_a_wrong_minimum_are_told():
     (path,) = Lorenz63.from_settings(Lorenz63.Settings()).trajectories(start, times)
     read = path.states[:, :3] + rng.standard_normal((48, 3))
 
-    def along(lag):
+    def along(lag, **keys):
         return en4dvar.estimate_sequence(
             "lorenz63", {name: (times, read[:, j]) for j, name in enumerate("xyz")}, {}, error=dict.fromkeys("xyz", 1),
             initial_std=dict.fromkeys("xyz", 1),
-            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag},
+            assimilation={"scheme": "ienks", "members": 12, "lag": lag, "shift": lag, **keys},
         )  # fmt: skip
 
     whole = along(48)
     assert np.sqrt(np.nanmean(whole.normalised**2)) < 1.2
     size = np.sqrt(np.mean((read - whole.run.analysis.mean[:, :3]) ** 2))
     assert size > 5
-    (told,) = whole.warnings
+    unsettled, told = whole.warnings
+    assert unsettled.startswith("1 of 1 cycle ended at max_iterations before they had settled, the worst at 12 with")
     assert told.startswith(f"residuals of the analyses are {size:.2g} times the errors: windows have ended in a wrong")
-    assert along(2).warnings == ()
+    assert along(2).warnings == along(2, max_iterations=1).warnings == ()

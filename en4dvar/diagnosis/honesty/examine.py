@@ -12,6 +12,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import DECISIVE, SHORT_STEP, UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
+from en4dvar.diagnosis.honesty.coarse import coarse
 from en4dvar.diagnosis.honesty.widening import enough
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array, Mask
@@ -73,6 +74,7 @@ def examine(
         *checks.fit(chi2 * n_used, n_used, dfs, factor),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
+        *coarse(a),
         *other_assumptions(a),
         *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing, wide) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),

@@ -247,6 +247,7 @@ class CommandModel(FunctionModel):
             read_once += itertools.chain(*output.instruction_files.values())
         texts = {path: languages.text_of(path) for path in read_once}
         super().__init__(Program(words, settings, texts), parameters, units, settings.time_unit)
+        self.interpolated = frozenset(name for name, of in settings.outputs.items() if of.time is not None)
 
     @classmethod
     def from_settings(cls, settings: CommandSettings) -> Self:

@@ -27,6 +27,8 @@ STDOUT = "stdout"  # what the program prints, as a file
 LOGARITHM = "log10("  # how a term log10(name) of a combination begins
 OWN_NAMES = ("input", "output", "here", "python", TIMES)
 _NAME = re.compile(r"\{([A-Za-z_]\w*)\}")
+_QUOTED = re.compile(r"""\\.|'[^']*'|"(?:\\.|[^"\\])*\"""")
+OF_A_SHELL = ("&&", "||", "|", ";", "&", ">", ">>", "<", "2>", "2>&1", "&>")  # words that no program is meant to get
 _WRITTEN = re.compile(r">+\s*\S+")  # into a file, by a shell
 WAYS = ("column", "key", "pattern", "instructions")
 
@@ -176,13 +178,18 @@ UnitOrSection = Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_i
 
 
 def _placed(command: str, info: ValidationInfo) -> str:
-    """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program."""
+    """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program, or a
+    word of a shell where none reads it."""
     base, shell = _base(info), bool(info.data.get("shell"))
     known = {"here": shlex.quote(str(base)), "python": shlex.quote(sys.executable)}
     command = fill(command, known)
     first, *others = split(command, shell)
     if shell:
         return command
+    if sign := next((word for word in _QUOTED.sub("_", command).split() if word in OF_A_SHELL), ""):
+        raise ValueError(
+            f"the program would get {sign} as an argument; write shell: true, or '{sign}' if that is meant"
+        )
     if Path(first).name != first:
         path = base / expanded(first)
         if not path.is_file():

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from en4dvar.plumbing.called import advised
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 
@@ -17,7 +18,7 @@ def write_example(name: str, folder: Path, force: bool = False) -> Path:
     items = {folder / file.relative_to(example): file for file in sorted(example.rglob("*")) if file.is_file()}
     for path in items:
         if path.exists() and not force:
-            raise OutputError(f"{path}: exists; give --force to replace it")
+            raise OutputError(f"{path}: exists; give {advised('--force')} to replace it")
     for path, source in items.items():
         make_folder(path.parent)
         write_text(path, source.read_text(encoding="utf-8"))

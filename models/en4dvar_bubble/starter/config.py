@@ -29,7 +29,7 @@ from en4dvar_bubble.starter.look import Start, usable
 from en4dvar_bubble.starter.proposal import Proposal, propose, with_columns
 
 SCHEMA_FILE = "en4dvar.schema.json"
-_PLAIN = re.compile(r"[A-Za-z_./][\w ./*-]*[\w./*]|[A-Za-z_]")
+_PLAIN = re.compile(r"([A-Za-z_]|\.{0,2}/)([\w ./*-]*[\w./*])?")
 _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
