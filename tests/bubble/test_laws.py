@@ -128,6 +128,22 @@ class TestBatteryFinds:
 
         self.expect(Kinked)
 
+        class OfThePackage(Kinked):
+            r"""$J$, whose table has no halved cells unless the class says so."""
+
+            __module__ = "en4dvar_bubble.laws.kelvin_voigt"
+
+        (reason,) = filter(None, run_battery(OfThePackage()).values())
+        assert reason.endswith("kinked = True in the class halves the cells of its table")
+
+        class Said(OfThePackage):
+            r"""$J$"""
+
+            __module__ = "en4dvar_bubble.laws.kelvin_voigt"
+            kinked = True
+
+        self.expect(Said)
+
     def test_wrong_limit(self):
         class NotItsParent(Base):
             r"""$J$"""
