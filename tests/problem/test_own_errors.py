@@ -9,6 +9,7 @@ import pytest
 from toys import Linear, make_problem
 
 from en4dvar.data.noise import BoundNoise, DecayingErrors, HuberNoise, Noise, joint_noise, noise_of
+from en4dvar.data.noise.gaussian import Linearisation, Predicted
 from en4dvar.data.noise.own import _Trial
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate
@@ -77,6 +78,15 @@ def test_its_mode_is_that_of_its_density():
     (term,) = problem.prior.terms
     cost = 2 * np.log1p(((values - m) / 0.3) ** 2 / 3).sum(axis=1) + (grid - term.mean) ** 2 / (2 * term.std**2)
     assert analysis.centre[0] == pytest.approx(grid[np.argmin(cost)], abs=2e-3)
+
+
+@pytest.mark.parametrize("freedom", [3.0, np.linspace(2.0, 5.0, K)])
+def test_its_curvature_is_that_expected_of_its_density(freedom):
+    """Of Student's t (n + 1)/(n + 3). By ρ′/v, whose mean is 1, intervals were too narrow."""
+    noise = Student(STD, 0 * STD, freedom)
+    (_, rows), least = noise.whiten(np.zeros(K), np.ones(K), Linearisation(Predicted(np.zeros(K)), STD[None])), 1 / 3
+    np.testing.assert_allclose(rows[:, 0] ** 2, np.broadcast_to((freedom + 1) / (freedom + 3), K), rtol=1e-4)
+    assert noise.whitened_rows(np.zeros(K), STD[None], Predicted(np.full((1, K), 9.0)))[0, 0, -1] ** 2 < least
 
 
 @pytest.mark.parametrize(
