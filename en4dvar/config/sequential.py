@@ -12,7 +12,7 @@ from en4dvar.config.context import TEXT, Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, quantity, subject_unit
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.varies import ErrorOf, Knots, dynamic_fields
-from en4dvar.model.forward import ForwardModel
+from en4dvar.model.forward import ForwardModel, field_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes import ON_A_SERIES
@@ -188,9 +188,15 @@ def localisation_of(
     """Positions are indices of the one observed field, which fills the state but for the parameters. ``cells`` (p,) are
     the indices of the observations, by default all. Raises :class:`ConfigError`.
     """
-    fields = list(dynamic_fields(model).values())
-    if len(fields) != 1 or observed != {fields[0].name}:
-        raise ConfigError("needs a model whose state is one field, and this field observed")
+    fields, words = (
+        list(dynamic_fields(model).values()),
+        "needs a model whose state is one field, and this field observed",
+    )
+    if len(fields) != 1:
+        raise ConfigError(words)
+    read = [field_of(model, observable) for observable in model.observables if observable.name in observed]
+    if [field and field.name for field in read] != [fields[0].name]:
+        raise ConfigError(f"{words} as it is, by StateField({fields[0].name!r}), and nothing else")
     (field,) = fields
     where = np.arange(model.layout.size)[model.layout[field.name]]
     if settings.shape:

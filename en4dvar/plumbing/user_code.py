@@ -31,6 +31,7 @@ _permission: ContextVar[Permission | None] = ContextVar("permission", default=No
 LONGEST = 100_000_000  # bytes of a file of code
 MISTAKES = (AttributeError, ImportError, LookupError, NameError, TypeError)  # of the author, not of a state
 _in_worker = False
+_INSTALLED = {"site-packages", "dist-packages"}  # of this environment, of the user, of the Python below it
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), sysconfig.get_path("stdlib"))
 
 
@@ -109,7 +110,7 @@ def line_of(error: BaseException) -> str:
     """The last line of the user's that the error went through, if there is one outside of installed packages, or ""."""
     files = [(f.filename, f.lineno) for f in traceback.extract_tb(error.__traceback__)]
     own = [(name, line) for name, line in files if not name.startswith(("<", *_NOT_THE_USERS))]
-    own = [(name, line) for name, line in own if not is_installed(Path(name).resolve())] or own
+    own = [(name, line) for name, line in own if not _INSTALLED & {*Path(name).parts}] or own
     return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
 
 

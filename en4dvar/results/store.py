@@ -165,9 +165,9 @@ class StoredResult(Stored):
         return f"<{type(self).__name__} {self.name}: {brief(self.rows)}; {self.ended.partition(':')[0]}{warned}>"
 
     def __str__(self) -> str:
-        """The summary as a table (display units), how the fit ended, and the warnings."""
+        """The summary as a table (display units), how the fit ended, and the warnings with what to do."""
         parts = [results_table({self.name: self.rows}), self.ended]
-        return "\n".join([*parts, *(f"{caution.kind}: {caution.words}" for caution in self.cautions)])
+        return "\n".join([*parts, *(f"{caution.kind}: {caution}" for caution in self.cautions)])
 
     def _parameter(self, name: str) -> Parameter:
         return parameter_of(name, self.groups["/posterior"][name].attrs)

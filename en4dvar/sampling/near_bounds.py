@@ -29,6 +29,7 @@ from en4dvar.sampling.emulated_draws import EmulatedProposal
 from en4dvar.sampling.mixture import StudentMixture
 
 STRAIGHT = 0.995  # effective share of the members for which predictions may as well be linear in x
+NARROWEST = 1e7  # how many times wider the posterior may be in one direction than in another
 LEFT_OUT, KEPT = 3, 6  # turns of the walkers
 MANY = 500  # readings of other errors than Gaussian ones of known ratios, of which J of all walkers takes seconds
 
@@ -37,7 +38,8 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     """Members (N, n) in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,), all transformed.
 
     None where predictions that are linear in x say the same, where these are too many or not known in all directions,
-    and where the posterior is a mixture of its own: beside an estimated discrepancy or scale of what varies.
+    where one is so narrow that no covariance has the digits for it, and where the posterior is a mixture of its own:
+    beside an estimated discrepancy or scale of what varies.
     """
     problem, prior = space.problem, space.problem.prior
     mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)
@@ -60,8 +62,10 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
 
     if effective_share(cost(posterior, posterior - mode) - cost(posterior)) > STRAIGHT:
         return None
-    stream = member_stream(space.seed, "near bounds")
-    start = StudentMixture.fitted(prior.white(posterior), stream, 1)
+    white, stream = prior.white(posterior), member_stream(space.seed, "near bounds")
+    if np.linalg.cond(white - white.mean(axis=0)) > NARROWEST:
+        return None
+    start = StudentMixture.fitted(white, stream, 1)
     turns = [EmulatedProposal.bridged_from(start, lambda z: cost(prior.from_white(z)), stream)]
     for _ in range(LEFT_OUT + KEPT):
         turns.append(turns[-1].settled(stream))

@@ -128,6 +128,21 @@ class TestBatteryFinds:
 
         self.expect(Kinked)
 
+    @pytest.mark.parametrize("said", [False, True])
+    def test_a_kink_in_a_law_of_the_package_is_to_be_said(self, said, monkeypatch):
+        class Kinked(Base):
+            r"""$J$"""
+
+            kinked = said
+
+            def stress(self, stretch, p):
+                return super().stress(stretch, p) - p.G * np.maximum(stretch - 2, 0)
+
+        monkeypatch.setattr(Kinked, "__module__", "en4dvar_bubble.laws.kelvin_voigt")
+        reasons = [*filter(None, run_battery(Kinked()).values())]
+        words = "kinked = True in the class halves the cells of its table"
+        assert [reason.endswith(words) for reason in reasons] == [True] * (not said)
+
     def test_wrong_limit(self):
         class NotItsParent(Base):
             r"""$J$"""

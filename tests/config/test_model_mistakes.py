@@ -97,6 +97,20 @@ def test_a_mistake_in_from_settings_is_told_with_its_line(from_settings, words, 
     assert "Error: " not in words or f"{__file__}:" in str(caught.value)
 
 
+def test_the_line_is_not_that_of_a_library_of_another_environment(tmp_path, monkeypatch):
+    """As of a user's site, or of the Python below an environment with ``--system-site-packages``."""
+    (tmp_path / "site-packages").mkdir()
+    (tmp_path / "site-packages" / "borrowed.py").write_text("def size(settings):\n    return settings.size\n")
+    monkeypatch.syspath_prepend(tmp_path / "site-packages")
+    from borrowed import size
+
+    asks = classmethod(lambda cls, settings: size(settings))
+    made = type("Made", (Sound,), {"from_settings": asks, "Settings": NoSettings})
+    monkeypatch.setattr(toy_models, "Made", made, raising=False)
+    with pytest.raises(ConfigError, match=re.escape(f"({__file__}:")):
+        build_model(find_model("toy_models:Made"), NoSettings())
+
+
 def test_settings_that_are_no_pydantic_model_are_refused(monkeypatch):
     made = type("Made", (Sound,), {"from_settings": classmethod(lambda cls, s: cls()), "Settings": {"rtol": 1}})
     monkeypatch.setattr(toy_models, "Made", made, raising=False)

@@ -139,6 +139,19 @@ def test_a_field_on_a_grid_is_localised_in_cells(tmp_path, monkeypatch):
             load_twin(path)
 
 
+def test_a_function_of_the_field_under_its_name_is_not_localised(tmp_path, monkeypatch):
+    """Nobody knows where its values are: the first was taken for that of the first cell."""
+
+    class Turned(Sheet):
+        observables = (Observable("x", "1", lambda path: path["x"][..., ::-1]),)
+
+    load(tmp_path, monkeypatch, Turned)
+    path = tmp_path / "twin.yaml"
+    path.write_text(path.read_text().replace("members: 4", "members: 4, localisation: {radius: 1}"))
+    with pytest.raises(ConfigError, match=r"this field observed as it is, by StateField\('x'\), and nothing else"):
+        load_twin(path)
+
+
 @pytest.mark.parametrize(
     ("kind", "more", "message"),
     [

@@ -471,3 +471,4 @@ def test_of_series_in_different_units_a_factor_of_their_errors_is_advised(factor
     advised = re.search(r"state errors about ([\d.]+) times as large", told.advice)
     assert float(advised[1]) == pytest.approx(factor, rel=0.3)
     assert "is stated" not in told.advice
+    assert f"warning: {told.words}; {told.advice} [{told.code}]" in str(found).splitlines()

@@ -9,6 +9,8 @@ import pytest
 from toys import Linear, make_problem
 
 from en4dvar.data.noise import BoundNoise, DecayingErrors, HuberNoise, Noise, joint_noise, noise_of
+from en4dvar.data.noise.gaussian import Linearisation, Predicted
+from en4dvar.data.noise.make import noise_of_readings
 from en4dvar.data.noise.own import _Trial
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate
@@ -77,6 +79,30 @@ def test_its_mode_is_that_of_its_density():
     (term,) = problem.prior.terms
     cost = 2 * np.log1p(((values - m) / 0.3) ** 2 / 3).sum(axis=1) + (grid - term.mean) ** 2 / (2 * term.std**2)
     assert analysis.centre[0] == pytest.approx(grid[np.argmin(cost)], abs=2e-3)
+
+
+@pytest.mark.parametrize("freedom", [3.0, np.linspace(2.0, 5.0, K)])
+def test_its_curvature_is_that_expected_of_its_density(freedom):
+    """Of Student's t (n + 1)/(n + 3). By ρ′/v, whose mean is 1, intervals were too narrow."""
+    noise = Student(STD, 0 * STD, freedom)
+    (_, rows), least = noise.whiten(np.zeros(K), np.ones(K), Linearisation(Predicted(np.zeros(K)), STD[None])), 1 / 3
+    np.testing.assert_allclose(rows[:, 0] ** 2, np.broadcast_to((freedom + 1) / (freedom + 3), K), rtol=1e-4)
+    assert noise.whitened_rows(np.zeros(K), STD[None], Predicted(np.full((1, K), 9.0)))[0, 0, -1] ** 2 < least
+
+
+def test_a_down_weighted_reading_is_told_as_far_off_as_it_is():
+    """Not the threshold over its weight, which is so of Huber's ρ with one threshold alone."""
+    problem = make_problem(Linear(("a",)), [1.0])
+    values, far = problem.observations.values.copy(), len(problem.observations) - 1
+    values[far] += 6.0
+    half, std = len(values) // 2, np.full(len(values), 0.3)
+    thresholds = np.where(np.arange(len(values)) < half, 1.0, 3.0)
+    for noise in (Student(std, 0 * std), noise_of_readings(std, 0 * std, thresholds=thresholds)):
+        own = replace(problem, observations=replace(problem.observations, values=values, noise=noise))
+        analysis = assimilate(own, AssimilationSettings(members=8, what_if=False, refine="none", emulator="off"), 1)
+        off = abs(values[far] - analysis.centre_predictions[far]) / 0.3
+        (told,) = (str(c) for c in analysis.cautions if c.code == "down-weighted")
+        assert f"down-weighted: at {problem.observations.times[far]:.4g} s ({off:.2g} std off, " in told
 
 
 @pytest.mark.parametrize(

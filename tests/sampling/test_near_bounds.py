@@ -114,3 +114,15 @@ def test_ends_of_a_valley_that_is_bent_to_a_bound_are_those_of_quadrature(seed):
     said = found.sample_stats.attrs
     told = [said.get("tail_q05_a", row.q05), said.get("tail_q95_a", row.q95)]
     assert told == pytest.approx(ends, abs=0.4 * row.std)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("std", [1e-8, 1e-9])
+def test_a_sum_known_to_more_digits_than_a_covariance_has_is_told(std):
+    """As by the weight 1e9 of a control file: it ended in an error of linear algebra."""
+    prior, settings = {"prior": "uniform", "lower": 0, "upper": 3}, {"members": 16, "refine": "none"}
+    result = en4dvar.estimate(
+        lambda p, t: p["a"] + p["b"] * t + 0 * p["c"], ([1.0], [2.5]), dict.fromkeys("abc", prior),
+        error=std, assimilation=settings,
+    )  # fmt: skip
+    assert {"non-gaussian", "not-converged"} & set(result.sample_stats.attrs["warning_codes"].split())

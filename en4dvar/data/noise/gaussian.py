@@ -15,6 +15,8 @@ import numpy.typing as npt
 from en4dvar.model.state import Array, Mask
 
 Where = slice | npt.NDArray[np.intp]  # which readings
+_ARCS, _ARC = np.linspace(-12.0, 12.0, 1200, retstep=True)
+GRID, WIDTHS = np.sinh(_ARCS), np.cosh(_ARCS) * _ARC  # whitened residuals over which densities are integrated; no 0
 LOGS = (-300.0, 300.0)  # of σ, amplitude, length: what a polynomial says far from its runs stays a number
 
 
@@ -187,9 +189,19 @@ class Noise:
         """ρ'(v)/v (…, K) of whitened residuals, at most 1: how much of a Gaussian observation one counts."""
         return np.ones_like(residual)
 
+    @cached_property
+    def expected_curvature(self) -> float | Array:
+        """E[ρ''] under the density of ρ: of all readings, or (K,). It is E[ρ'²], which needs no ρ''."""
+        v = GRID[:, None]
+        density = np.exp(-self._loss(v)) * WIDTHS[:, None]
+        return np.asarray(np.sum(density * (v * self.influence(v)) ** 2, axis=0) / density.sum(axis=0))
+
     def _curvature(self, light: Array) -> Array:
-        """What stands for ρ''(v) (…, K) in SᵀS, from ρ'(v)/v."""
-        return light
+        """What stands for ρ''(v) (…, K) in SᵀS: its expectation, or ρ'/v of a reading so far off that it counts less.
+
+        Of ρ'/v alone, whose expectation is larger, intervals are too narrow, by 9 % with Huber's ρ.
+        """
+        return np.minimum(light, self.expected_curvature) if math.isfinite(self.counts_within) else light
 
     @property
     def counts_within(self) -> float:

@@ -41,19 +41,13 @@ class HuberNoise(Noise):
 
     @cached_property
     def expected_curvature(self) -> float:
-        """E[ρ''] under the density of ρ: the share within the threshold."""
+        """The share of the density within the threshold."""
         return self._inside / (self._inside + 2 / self.threshold * self._edge)
 
     @cached_property
     def scale_information(self) -> float:  # type: ignore[override]
         """E[v²ψ²] − 1 = 1 + E[v²ψ'], ψ = ρ': for large thresholds the same as for Gaussian errors."""
         return 1 + (self._inside - 2 * self.threshold * self._edge) / math.exp(self._log_norm())
-
-    def _curvature(self, light: Array) -> Array:
-        """ρ'' is 1 within the threshold and 0 beyond; this is its expectation, or ρ'/v of a reading so far off that it
-        counts less. Of ρ'/v alone, whose expectation is larger, intervals are 9 % too narrow.
-        """
-        return np.minimum(light, self.expected_curvature)
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
         """Within the threshold of a Gaussian cut there, beyond it exponential."""

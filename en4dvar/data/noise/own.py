@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted
+from en4dvar.data.noise.gaussian import GRID, WIDTHS, Linearisation, Noise, Predicted
 from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.hints import shown
@@ -17,8 +17,6 @@ from en4dvar.plumbing.user_code import line_of, reason_of
 
 RESIDUALS = (0.31, -0.77, 1.43, -2.9, 0.11, 5.3, -1.9)  # whitened, at which it is tried
 STEP, CLOSE = 1e-4, 1e-3  # of a finite difference, and how well it is the slope
-_ARCS, _ARC = np.linspace(-12.0, 12.0, 1201, retstep=True)
-GRID, WIDTHS = np.sinh(_ARCS), np.cosh(_ARCS) * _ARC  # whitened residuals over which densities are integrated
 APART = 0.02  # by which an integral may differ
 DRAWS, MOST = 4000, 2000  # numbers that are drawn; readings over whose densities is integrated
 

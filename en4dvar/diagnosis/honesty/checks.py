@@ -384,13 +384,15 @@ def _two(p: Parameter, between: str, first: float, second: float) -> str:
 
 
 def down_weighted(analysis: Analysis) -> Findings:
-    """Observations that a robust cost counts less, as far off as their weight says; :data:`MOST_LISTED` are listed."""
+    """Observations that a robust cost counts less; :data:`MOST_LISTED` are listed."""
     weights = analysis.down_weights
     if weights is None or not np.any(weights < 1):
         return
     lighter, moment, within = np.flatnonzero(weights < 1), moments(analysis), analysis.observations.noise.counts_within
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    off = (f"{moment[k]} ({within / weights[k]:.2g} std off, weight {weights[k]:.2g})" for k in worst)
+    left = analysis.problem.observations.values - analysis.centre_predictions
+    left = np.abs(left if analysis.discrepancy is None else left - analysis.discrepancy.mean) / analysis.own_std
+    off = (f"{moment[k]} ({left[k]:.2g} std off, weight {weights[k]:.2g})" for k in worst)
     where, lie = listed(off, MOST_LISTED), "lies" if len(worst) == 1 else "lie"
     beyond = f"{len(worst)} of {len(weights)} observations {lie} beyond {within:g} standard deviations"
     yield caution("down-weighted", f"{beyond}, down-weighted: at {where} {CLOCK}")

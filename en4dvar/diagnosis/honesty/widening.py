@@ -16,7 +16,7 @@ from en4dvar.priors.prior import Prior
 
 MARGIN = 0.7  # of the distances that are told, since predictions are not linear
 WIDEST = 1000
-
+KNOWN = 1e-8  # variance, relative to the prior's, below which a direction is known: a sum with 1/WIDEST² keeps digits
 
 Wider = tuple[Sequence[int], int]  # parameters, and how many times as wide their priors
 
@@ -49,7 +49,7 @@ def enough(prior: Prior, centre: Array, members: Array) -> Wider | None:
     to_white = prior.white_change(np.eye(n)).T
     white = prior.white(members) - prior.white(centre)
     values, axes = np.linalg.eigh(white.T @ white / (len(members) - 1))
-    known = axes @ np.diag(1 / np.clip(values, 1e-12, 1.0) - 1) @ axes.T  # Λ, in white coordinates
+    known = axes @ np.diag(1 / np.clip(values, KNOWN, 1.0) - 1) @ axes.T  # Λ, in white coordinates
     pull = known @ prior.white(centre) + prior.white(centre)
     for count in range(1, n + 1):
         wide = order[:count]
