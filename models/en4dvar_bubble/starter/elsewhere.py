@@ -232,8 +232,8 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
     return [
         f"{names}the collapse takes {ratio:.2f} of the Rayleigh time; in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "
         f"takes {usual:.2f}{scale} The gel may be softer or thicker, or a rigid plane may be nearby (wall of the "
-        f"vessel, cover glass). A plane makes G too small by about {near} and leaves no other trace (a free surface of the gel "
-        f"makes it too large). If one is within 10 R_max, state its distance from the bubble's centre{alone}: "
+        f"vessel, cover glass). A plane makes G too small by about {near} and leaves no other trace (a free surface of "
+        f"the gel makes it too large). If one is within 10 R_max, state its distance from the bubble's centre{alone}: "
         f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
     ]
 
