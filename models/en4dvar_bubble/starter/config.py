@@ -34,6 +34,10 @@ _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
 AREA = re.compile(r"(?i)(.*[\W_])?(area|fläche)([ _(\[].*)?$")
+EACH_ROW = (
+    "each row is taken for the next frame: one that has no row (or a blank line), as where no bubble was seen, makes "
+    "all later times too early; give a column of times or of frames, or write NaN in its row"
+)
 OF_AREA = "of an area the radius is √(area/π): write a column of it"
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
 LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
@@ -313,6 +317,9 @@ def doubts(source: Source) -> list[str]:
     words = []
     for what, kind, column in (("times", "s", source.time), ("radii", "m", source.radius)):
         if column is None:
+            words += [EACH_ROW] * (
+                source.step_unit is None
+            )  # else the file states the step, as one that keeps all frames
             continue
         name, unit = column
         diameter, pixels, scaled = bool(DIAMETER.match(name)), PIXELS.search(name), "*" in unit
