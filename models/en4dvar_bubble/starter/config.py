@@ -35,8 +35,8 @@ FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
 AREA = re.compile(r"(?i)(.*[\W_])?(area|fläche)([ _(\[].*)?$")
 EACH_ROW = (
-    "each row is taken for the next frame: one that has no row (or a blank line), as where no bubble was seen, makes "
-    "all later times too early; give a column of times or of frames, or write NaN in its row"
+    "each row is taken for the next frame: one that has no row, as where no bubble was seen, makes all "
+    "later times too early; give a column of times or of frames, or write NaN in its row"
 )
 OF_AREA = "of an area the radius is √(area/π): write a column of it"
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
