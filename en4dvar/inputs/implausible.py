@@ -298,6 +298,8 @@ def check_order(
     ends = np.flatnonzero(np.diff(times) < 0)
     if bounds and times[after] == times[before]:
         hint = APART
+    elif len(ends) >= SEVERAL and np.all(np.diff(values) > 0):
+        hint = "the readings do, from row to row: are the columns of times and readings exchanged?"
     elif column := _telling_apart(path, layout, kept, lines, wanted, times):
         name = column if column.isidentifier() else repr(column)
         hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"

@@ -163,7 +163,8 @@ def read_series(
     columns, scalars, lines = columns_of(path, layout, wanted, part)
     converted = {column: convert(columns[column.name], column.unit, column.target) for column in asked}
     values = converted[value]
-    times = converted[time] if isinstance(time, Column) else _step(time, scalars, path) * np.arange(float(len(values)))
+    frames, numbers = np.arange(float(len(values))), lines if layout.by is None else []
+    times = converted[time] if isinstance(time, Column) else _step(time, scalars, path, numbers) * frames
     if not len(values):
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
@@ -281,7 +282,12 @@ def scalar_of(column: Column, scalars: Mapping[str, float], path: Path, what: st
     return float(convert(scalars[column.name], column.unit, column.target))
 
 
-def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
+def _step(step: TimeStep, scalars: Mapping[str, float], path: Path, lines: Sequence[int]) -> float:
+    """The constant step. Raises :class:`DataError`: it is none, or a line of the table between others holds nothing."""
+    skips = np.diff(lines)
+    if len(uneven := np.flatnonzero(skips > min(skips, default=1))):
+        where = f"{path}:{lines[uneven[0]] + 1}: a line without a reading between others of a constant step"
+        raise DataError(f"{where}; write NaN in it where a frame has none, or delete it where no frame is missing")
     value = step.value if step.column is None else scalar_of(step.column, scalars, path, "the time step")
     if not value > 0:
         raise DataError(f"{path}: the time step {value:g} is not positive")

@@ -22,6 +22,7 @@ from en4dvar.results.netcdf import Group
 from en4dvar.results.store import StoredResult
 
 MAX_PAIRS = 6
+NINETY = 1.6448536  # standard score of the 95 % quantile
 WIDER = 3  # spans of the posterior by which the prior is seen to either side of it
 LEVELS = 32  # colours of a map
 BAND = (0.05, 0.5, 0.95)
@@ -68,6 +69,18 @@ def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array
     x = np.concatenate([values[:1], values[:-1] + np.diff(values) / 2, values[-1:]])
     density = np.concatenate([density[:1], density, density[-1:]]) / density.max()
     return x, np.zeros_like(x), density
+
+
+def prior_interval(result: StoredResult, name: str) -> tuple[float, float]:
+    """5 and 95 % of a prior, in its display unit: of the prior itself, and of its members where it is not stored."""
+    stats, prior = result.group("sample_stats"), result.members("prior", name)
+    if "prior_value" in stats:
+        place = stats["parameter"].values.tolist().index(name)
+        values = shown(result.parameters[name], stats["prior_value"].values[place])
+        ends = np.interp((-NINETY, NINETY), stats["prior_score"].values, values)
+    else:
+        ends = member_quantiles(prior, (0.05, 0.95)) if prior.size else np.full(2, np.nan)
+    return float(ends[0]), float(ends[1])
 
 
 def residuals(result: StoredResult) -> Chart:

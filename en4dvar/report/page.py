@@ -20,7 +20,7 @@ from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import ABOUT, Caution, codes, gravity, worst_first
 from en4dvar.report import responses
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
-from en4dvar.report.figures import all_figures, neighbours, stored_walks
+from en4dvar.report.figures import all_figures, neighbours, prior_interval, stored_walks
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import Captioned, draw
@@ -142,7 +142,9 @@ Headline = tuple[str, str, Sequence[str], Sequence[Captioned], Sequence[Caution]
 
 @dataclass(frozen=True)
 class SetSummary:
-    """What the overview keeps of one data set: a row a parameter, the scalars of its fit, its warnings."""
+    """What the overview keeps of one data set: a row a parameter, the scalars of its fit, its warnings, the 5 and 95 %
+    of each prior.
+    """
 
     name: str
     stem: str
@@ -150,6 +152,7 @@ class SetSummary:
     cautions: tuple[Caution, ...]
     scalars: Mapping[str, float]
     about: Mapping[str, str] = field(default_factory=dict)
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, result: StoredResult, stem: str) -> "SetSummary":
@@ -158,7 +161,8 @@ class SetSummary:
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
         about = {key: sys.intern(str(result.attributes.get(key, ""))) for key in ("date_created", "configuration")}
         scalars = {key: float(stats[key]) for key in keys}
-        return cls(result.name, stem, {row.name: row for row in result.rows}, result.cautions, scalars, about)
+        rows, priors = {row.name: row for row in result.rows}, {n: prior_interval(result, n) for n in result.parameters}
+        return cls(result.name, stem, rows, result.cautions, scalars, about, priors)
 
     @property
     def worst(self) -> str:
@@ -206,9 +210,8 @@ def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
     low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
     panel = Panel(ylabel=with_unit(rows[0].symbol, rows[0].unit), yticks=4, x_numbers=False)
     order = np.argsort(mean)
-    means, stds = np.array([(row.prior_mean, row.prior_std) for row in rows]).T
-    least, most = means - stds, means + stds
-    if np.ptp(means) <= 0.5 * stds.min() and stds.max() <= 2 * stds.min():  # as two sets of members of a prior are
+    least, most = np.array([sets[i].priors[name] for i in x]).T
+    if max(np.ptp(least), np.ptp(most)) <= 0.1 * (most - least).min():
         panel.span(float(least[0]), float(most[0]), "prior", 0.2)
     elif few:
         for at, bottom, top in zip(x, least, most, strict=True):
@@ -235,11 +238,11 @@ def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
 def overview_figures(sets: Sequence[SetSummary], population: Collection[str] = ()) -> list[Captioned]:
     """The estimates; where there is a ``population``, those of its parameters first and the others by themselves."""
     caption = (
-        "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey, each data set's own where "
-        "they differ clearly). Orange rings without a bar: not to be trusted, for their warnings."
+        "Each data set by itself: posterior mean and 5–95 % (blue), 5–95 % of the prior (grey, each data set's own "
+        "where they differ clearly). Orange rings without a bar: not to be trusted, for their warnings."
         if len(sets) <= NAMED
-        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); prior "
-        "mean ± std (grey, each data set's own where they differ clearly)."
+        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); 5–95 % "
+        "of the prior (grey, each data set's own where they differ clearly)."
     )
     names = _parameters(sets)
     first = [name for name in names if name in population] or names

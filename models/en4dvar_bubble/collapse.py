@@ -199,11 +199,11 @@ def doubt(view: Lobe, medium: Medium, expected: Expected = NOTHING) -> str:
         if long:
             limit = f"; a gel of {COMMON.mu:g} Pa s allows no more than {largest:.2f}" if largest < FAR else ""
         more = f", or the gel is {'thicker' if long else 'stiffer'}" if conceivable(view, medium) else ""
-        return f"{_measured(ratio)}{limit}: {_explained(SOFT / ratio)}{more}"
+        return f"{_measured(ratio)}{limit}: {explained(SOFT / ratio)}{more}"
     if len(ratios) and not expected.reaches(ratio, apart):
         usual = float(np.median(ratios))
         span = f"{min(ratios):.2f} to {max(ratios):.2f}"
-        return f"{_measured(ratio)}; the prior expects {span}: {_explained(usual / ratio)}, or the prior is wrong"
+        return f"{_measured(ratio)}; the prior expects {span}: {explained(usual / ratio)}, or the prior is wrong"
     return ""
 
 
@@ -222,7 +222,7 @@ def _twice(factor: float) -> bool:
     return 2 / SAME_FACTOR < factor < 2 * SAME_FACTOR
 
 
-def _explained(factor: float) -> str:
+def explained(factor: float) -> str:
     """What would make the history that of a usual bubble; ``factor`` is what its collapse time falls short by."""
     if _twice(factor):
         return "diameters given as radii? Or a time step, a pixel or a unit is wrong by a factor of 2"

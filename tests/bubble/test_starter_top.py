@@ -200,6 +200,15 @@ def test_a_radius_that_changes_after_it_has_settled_drifts(change: float) -> Non
     assert "where it should rest" in look(t, r * np.where(t > 190e-6, change, 1)).drift
 
 
+def test_a_rebound_that_rests_near_its_top_does_not_drift() -> None:
+    """As where a file begins behind the collapse: "R goes from 42.8 to 42.8 um where it should rest"."""
+    t = np.arange(120) * 1e-6
+    r = 40e-6 + 20e-6 * np.sin(t / 3e-6) ** 2 * np.exp(-t / 15e-6)
+    seen = look(t, r, "laser")
+    assert np.isnan(seen.rest)
+    assert seen.drift.startswith("R rests at 40 um, above 0.6 of its maximum, 5")
+
+
 @pytest.mark.parametrize("ends", [90, 100, 129])
 @pytest.mark.parametrize("largest", [220e-6, 310e-6])
 def test_rebounds_that_die_away_are_no_drift(largest: float, ends: float) -> None:

@@ -79,6 +79,7 @@ def test_a_table_without_times_needs_the_frame_rate_alone(tmp_path: Path, header
     Path("rows.csv").write_text("\n".join([header, *(f"{r:g}{',1' * header.count(',')}" for r in R), ""]))
     done = call("init", "--data", "rows.csv", "--frame-rate", f"{1 / 0.7:.17g} MHz")
     assert done.exit_code == 0, done.output
+    assert "warning: each row is taken for the next frame: one that has no row" in done.stderr
     (read,) = build(proposed(Path("rows.yaml")))
     assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
     (known,) = build(proposed(Path("b.yaml")))

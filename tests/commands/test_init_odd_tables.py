@@ -172,6 +172,15 @@ def test_diameters_in_pixels_need_half_the_size_of_a_pixel(tmp_path: Path) -> No
     assert "add --radius-unit UNIT (e.g. 0.5*um, since 'Diameter' seems to hold diameters)" in output
 
 
+def test_areas_are_no_radii(tmp_path: Path) -> None:
+    """As ImageJ writes them unless it is told otherwise: "unit 'um^2' cannot be converted to 'm'" was all."""
+    text, words = rows("t_us,Area\n", np.pi * radii() ** 2), "of an area the radius is √(area/π): write a column of it"
+    code, output = told(tmp_path, text, "--radius-column", "Area", "--radius-unit", "um^2")
+    assert (code, words in output) == (2, True)
+    _, output = told(tmp_path, text, "--radius-column", "Area", "--radius-unit", "um", "--force")
+    assert f"'Area' seems to hold areas; {words}" in output
+
+
 def test_diameters_in_german(tmp_path: Path) -> None:
     code, output = told(tmp_path, rows("Zeit_us;Durchmesser_um\n", 2 * radii(), "{:.3f};{:.3f}\n"))
     assert code == 0, output

@@ -366,6 +366,13 @@ def test_a_weighted_median():
     assert median_of(np.array([0.0, 1.0, 2.0]), np.array([0.01, 50.0, 50.0]), member_stream(1, "a"))[0] < 1.0
 
 
+def test_the_interval_of_data_sets_that_say_little_holds_what_they_all_say():
+    """Each says 2 with an error that leaves half of the prior's width, and so has 1.5: they agree, but not with 2."""
+    centre, spread = median_of(np.full(12, 1.5), np.full(12, 0.5), member_stream(1, "a"))
+    assert centre == pytest.approx(1.5)
+    assert centre + 1.645 * spread > 2.0
+
+
 def test_a_few_that_are_sure_do_not_outweigh_many_others():
     """Seven of ten lie about 0 ± 0.6, three at 1.4 ± 0.1."""
     middle, std = np.array([-0.5, -0.3, -0.1, 0.1, 0.2, 0.3, 0.5, 1.4, 1.4, 1.4]), np.array([0.6] * 7 + [0.1] * 3)

@@ -69,6 +69,12 @@ def test_one_series_is_sorted(tmp_path: Path, rows: list[tuple[object, ...]]) ->
     np.testing.assert_allclose(read.values, 1e-6 * A)
 
 
+def test_times_in_the_column_of_readings_are_not_sorted(tmp_path: Path) -> None:
+    """Sorted by their radii and averaged, exchanged columns were "a thick gel"."""
+    told = advice(tmp_path / "t.csv", "t,R", [(r, 1 + t) for t, r in ONE], "refuse")
+    assert told.endswith("are the columns of times and readings exchanged?")
+
+
 def test_of_vectors_no_column_is_asked_for(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"t": np.tile(T, 2), "R": np.concatenate([A, B])})
     with pytest.raises(DataError, match=r"sample 21: .*: give each a file of its own; of one series [a-z ,]*$"):

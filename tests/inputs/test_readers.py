@@ -194,6 +194,19 @@ def test_mat_time_step(tmp_path: Path) -> None:
         mat(tmp_path, step, R=radius, deltat=0.0)
 
 
+def test_a_blank_line_is_no_frame_of_a_constant_step_in_silence(tmp_path: Path) -> None:
+    """It was passed over, and the collapse behind two of them was two frames too early."""
+
+    def read(text: str) -> list[float]:
+        (tmp_path / "a.csv").write_text(text)
+        return read_series(tmp_path / "a.csv", TimeStep(value=2.0), Column("R", "m", "m")).times.tolist()
+
+    with pytest.raises(DataError, match=r"a\.csv:5: a line without a reading .* write NaN in it"):
+        read("R\n\n5\n6\n\n7\n8\n\n")
+    assert read("R\n5\n6\nNaN\n7\n8\n\n\n") == [0.0, 2.0, 6.0, 8.0]
+    assert read("R\n\n5\n\n6\n\n7\n") == [0.0, 2.0, 4.0]  # every other line, as some programs write
+
+
 def test_bad_mat(tmp_path: Path) -> None:
     told = r"field 'R' is not in the file; the vectors are: Rnew, t; no vectors: image \(an array of 3 x 3\)"
     with pytest.raises(DataError, match=told):

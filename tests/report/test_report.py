@@ -335,22 +335,6 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     assert "Of 20000 data sets the 2000 with the gravest warnings are listed" in html
 
 
-@pytest.mark.parametrize("count", [3, 50])
-def test_priors_of_the_overview_are_each_data_set_s_own_where_they_differ(analysis, count):
-    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
-    name, row = next(iter(one.rows.items()))
-    rows = [replace(row, prior_mean=10.0 * i, prior_std=1.0, mean=10.0 * i, q05=0.0, q95=1e3) for i in range(count)]
-    sets = [replace(one, rows={**one.rows, name: own}) for own in rows]
-    (_, _, drawn), (_, _, others) = overview_figures(sets, [name])
-    ((panel,),) = (line.panels for line in drawn.rows)
-    grey = [mark for mark in panel.marks if mark.colour == "prior"]
-    assert sorted(v for mark in grey for v in {*mark.y}) == [10.0 * i - 1 for i in range(count)]
-    assert sorted(v for mark in grey for v in {*mark.top}) == [10.0 * i + 1 for i in range(count)]
-    assert len(others.rows) == len(one.rows) - 1
-    for line in others.rows:
-        assert [mark.kind for mark in line.panels[0].marks if mark.colour == "prior"] == ["span"]
-
-
 def test_half_of_the_data_sets_is_half_of_those_to_be_trusted(analysis):
     one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
     name, row = next(iter(one.rows.items()))

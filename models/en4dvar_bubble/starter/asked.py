@@ -11,9 +11,19 @@ from typing import Any
 import numpy as np
 
 from en4dvar.inputs.parts import Contents, Layout, read_contents
-from en4dvar.plumbing.errors import ConfigError, DataError
-from en4dvar.plumbing.units import as_unit, convert
-from en4dvar_bubble.starter.config import DIAMETER, FRAMES, PIXELS, TRACKED, quoted, unit_in, without_unit
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
+from en4dvar.plumbing.units import UnitError, as_unit, convert
+from en4dvar_bubble.starter.config import (
+    AREA,
+    DIAMETER,
+    FRAMES,
+    OF_AREA,
+    PIXELS,
+    TRACKED,
+    quoted,
+    unit_in,
+    without_unit,
+)
 
 _TIME = re.compile(r"(?i)(t|time|zeit)([ _(\[].*)?")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
@@ -216,7 +226,8 @@ class Asked:
         if self.tracked:
             return {"radius": TRACKED.radius, "time": TRACKED.time, "errors": TRACKED.errors}
         radius = (self.radius_column, self.radius_unit)
-        convert(1.0, str(self.radius_unit), "m")
+        with retold(UnitError, UnitError, f"--radius-unit: {OF_AREA}: " * bool(AREA.match(str(self.radius_column)))):
+            convert(1.0, str(self.radius_unit), "m")
         if self.time_step is not None:
             return {"radius": radius, "time_step": self.time_step}
         convert(1.0, str(self.time_unit), "s")

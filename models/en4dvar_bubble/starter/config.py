@@ -33,6 +33,12 @@ _PLAIN = re.compile(r"([A-Za-z_]|\.{0,2}/)([\w ./*-]*[\w./*])?")
 _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
+AREA = re.compile(r"(?i)(.*[\W_])?(area|fläche)([ _(\[].*)?$")
+EACH_ROW = (
+    "each row is taken for the next frame: one that has no row, as where no bubble was seen, makes all "
+    "later times too early; give a column of times or of frames, or write NaN in its row"
+)
+OF_AREA = "of an area the radius is √(area/π): write a column of it"
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
 LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
 ODD_SCALE = 50.0  # of the median of all files: bubbles of one experiment are closer
@@ -311,6 +317,9 @@ def doubts(source: Source) -> list[str]:
     words = []
     for what, kind, column in (("times", "s", source.time), ("radii", "m", source.radius)):
         if column is None:
+            words += [EACH_ROW] * (
+                source.step_unit is None
+            )  # else the file states the step, as one that keeps all frames
             continue
         name, unit = column
         diameter, pixels, scaled = bool(DIAMETER.match(name)), PIXELS.search(name), "*" in unit
@@ -323,6 +332,8 @@ def doubts(source: Source) -> list[str]:
             words.append(f"{name!r} seems to hold diameters; if so, {unit} must be half the size of a pixel: is it?")
         if what == "radii" and diameter and not scaled and not pixels:
             words.append(f"{name!r} seems to hold diameters; if so, give half their unit, --radius-unit '0.5*{unit}'")
+        if what == "radii" and AREA.match(name):
+            words.append(f"{name!r} seems to hold areas; {OF_AREA}")
         named = None if diameter and scaled else unit_in(name, kind)
         if named and parse_unit(named) != parse_unit(unit):
             words.append(f"the name of column {name!r} says {named}, but its unit is given as {unit}")

@@ -16,7 +16,7 @@ from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
-from en4dvar_bubble.collapse import FAR, doubt
+from en4dvar_bubble.collapse import FAR, doubt, explained
 from en4dvar_bubble.laws.base import ConstitutiveLaw
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
@@ -210,25 +210,30 @@ def wall(radius: float, slowness: float) -> tuple[Entry, Entry]:
 def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
     """What a plane would do to G of the bubbles whose collapse takes longer than in a gel as :data:`OF_GELS` are, by
     more than the instant of the top, where it begins, is uncertain; one line or none. A softer or thicker gel does so,
-    too; 1 % of the collapse time is worth 1 kPa.
+    too; 1 % of the collapse time is worth 1 kPa. Where most bubbles do not, a scale of these few may be wrong instead.
     """
     G, mu = (OF_GELS[name][0] for name in ("G", "mu"))
-    slow = {}
+    slow, others = {}, []
     for name, view in views.items():
         lobe, unsure = view.lobe, view.top.time_std / view.lobe.t_c
         usual = 1 + BY_VISCOSITY * mu / (lobe.R_max * math.sqrt(medium.rho * medium.p_inf))
         if (ratio := lobe.rayleigh_ratio(medium)) > usual + unsure and not doubt(lobe, medium):
             slow[name] = ratio, usual, 1e6 * lobe.R_max
+        else:
+            others.append(ratio)
     if not slow:
         return []
     ratio, usual, radius = np.median([*slow.values()], axis=0)
     names = f"{listed(slow, 3)}: " * (len(views) > 1)
+    few, rest = len(others) > len(slow), float(np.median(others or [ratio]))
+    scale = f", in the other {len(others)} it takes {rest:.2f}: {explained(rest / float(ratio))}?" if few else "."
+    alone = ", for these files alone, in a folder of their own" * few
     near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
     return [
         f"{names}the collapse takes {ratio:.2f} of the Rayleigh time; in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "
-        f"takes {usual:.2f}. The gel may be softer or thicker, or a rigid plane may be nearby (wall of the vessel, "
-        f"cover glass). A plane makes G too small by about {near} and leaves no other trace (a free surface of the gel "
-        f"makes it too large). If one is within 10 R_max, state its distance from the bubble's centre: "
+        f"takes {usual:.2f}{scale} The gel may be softer or thicker, or a rigid plane may be nearby (wall of the "
+        f"vessel, cover glass). A plane makes G too small by about {near} and leaves no other trace (a free surface of "
+        f"the gel makes it too large). If one is within 10 R_max, state its distance from the bubble's centre{alone}: "
         f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
     ]
 

@@ -409,7 +409,10 @@ def _rest(times: Array, radius: Array, peak: Lobe) -> tuple[float, str]:
     change, moments = math.log(rest / earlier), np.cov(times[-quarter:], np.log(tail))
     steadily = moments[0, 1] < -STEADY * math.sqrt(moments[0, 0] * moments[1, 1])
     falls = change <= -DRIFTS and (steadily or np.std(np.log(before)) <= SETTLED)
-    if rest > GAS * peak.R_max or change >= DRIFTS or falls:
+    if rest > GAS * peak.R_max:
+        told = f"R rests at {1e6 * rest:.3g} um, above {GAS:g} of its maximum, {1e6 * peak.R_max:.3g} um"
+        return float("nan"), f"{told} (do the readings begin behind a larger one, or behind the collapse?)"
+    if change >= DRIFTS or falls:
         return float("nan"), f"R goes from {1e6 * earlier:.3g} to {1e6 * rest:.3g} um where it should rest"
     return rest, ""
 
