@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -12,17 +13,23 @@ from en4dvar.descent.window import Descent
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
 from en4dvar.priors.prior import Prior
+from en4dvar.schemes.base import GaussNewtonStep
 
 AGREE = 2  # descents from different members that must have ended in the lowest minimum
 UNSEEN = 0.115  # chance of ending lower that settles a search: two descents that agree and one elsewhere do, 1/9
 REACHED = 2.0  # posterior standard deviations between a minimum and a descent that ended in it
 SLOPE = 4.0  # as many, within which one that ended early on the slope of a minimum is told from another minimum
+WIDER = 10.0  # times as wide in the mean over directions, each of two Gaussians as the other: of another shape
+BESIDE = 1e-3  # of the evidence of a minimum, which one of another shape must hold
 
 
 @dataclass(frozen=True)
 class Minimum:
     """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, the prior
     ``members`` from which descents ended in it (N: the prior mean), and by how much J of these differs.
+
+    ``shapes``: the Gaussians, by their linearisations, of other descents that ended in it or of points on the way
+    there, where these are utterly different: as of the other side of a kink, of which no descent may end.
     """
 
     x: Array
@@ -30,13 +37,19 @@ class Minimum:
     cost: float
     members: tuple[int, ...] = ()
     spread: float = 0.0
+    shapes: "tuple[Minimum, ...]" = ()
 
     @classmethod
     def of(cls, space: WeightSpace, end: Descent) -> "Minimum":
         """Where a descent has ended; the Hessian of J is known there or close by."""
-        covariance = space.anomalies.T @ end.newton.hessian.solve(space.anomalies.T).T
+
+        def about(w: Array, step: GaussNewtonStep, *more: Any) -> "Minimum":
+            covariance = space.anomalies.T @ step.hessian.solve(space.anomalies.T).T
+            return cls(space.control(w), np.asarray(covariance), *more)
+
         spread = max(0.0, end.highest - end.cost)
-        return cls(space.control(end.weights.w), np.asarray(covariance), end.cost, end.members, spread)
+        shapes = tuple(about(step.w + step.direction, step, cost) for step, cost in end.passed)
+        return about(end.weights.w, end.newton, end.cost, end.members, spread, shapes)
 
     @property
     def descents(self) -> int:
@@ -47,6 +60,14 @@ class Minimum:
         """Of a control vector (n,), in posterior standard deviations."""
         apart = x - self.x
         return math.sqrt(max(0.0, float(apart @ self._precision @ apart)))
+
+    def unlike(self, other: "Minimum") -> bool:
+        """Whether the Gaussian about either is :data:`WIDER` than the other, and the other's evidence counts."""
+        pairs, least = ((self, other), (other, self)), WIDER**2 * len(self.x)
+        if any(np.sum(narrow._precision * wide.covariance) < least for narrow, wide in pairs):
+            return False
+        volumes = np.linalg.slogdet(other.covariance)[1] - np.linalg.slogdet(self.covariance)[1]
+        return bool(self.cost - other.cost + 0.5 * volumes > math.log(BESIDE))
 
     @cached_property
     def _precision(self) -> Array:
@@ -107,10 +128,14 @@ def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
                 break
         else:
             places.append([minimum])
-    return tuple(_as_one(*place) if len(place) > 1 else place[0] for place in places)
+    return tuple(_as_one(*place) if len(place) > 1 or place[0].shapes else place[0] for place in places)
 
 
 def _as_one(lowest: Minimum, *others: Minimum) -> Minimum:
-    spread = max(lowest.spread, *(minimum.cost + minimum.spread - lowest.cost for minimum in others))
+    spread = max([lowest.spread, *(minimum.cost + minimum.spread - lowest.cost for minimum in others)])
     members = {*lowest.members, *(member for minimum in others for member in minimum.members)}
-    return replace(lowest, members=tuple(sorted(members)), spread=spread)
+    shapes = list[Minimum]()
+    for other in (shape for minimum in (lowest, *others) for shape in (minimum, *minimum.shapes)):
+        if all(shape.unlike(other) for shape in (lowest, *shapes)):
+            shapes.append(replace(other, shapes=()))
+    return replace(lowest, members=tuple(sorted(members)), spread=spread, shapes=tuple(shapes))

@@ -213,6 +213,7 @@ class Rounds(DataWindow):
             step, before = descent.newton, descent.cost
             if move is not None:
                 self.record(descent, step.hessian.economical_transform, move.step_length)
+                descent.passed += ((step, before - step.predicted_decrease),)
                 descent.weights, descent.cost = self.space.weights_at(move.w, step.hessian), move.cost
                 rough = max(before - move.cost, step.predicted_decrease) <= self.rough * max(1.0, move.cost)
                 descent.ended = rough or descent.iteration == self.space.minimiser.max_iterations
@@ -243,3 +244,4 @@ def _end_those_that_met(descents: Sequence[Descent]) -> None:
             if not higher.ended and lower.newton.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
                 lower.members, higher.members, higher.ended = (*lower.members, *higher.members), (), True
                 lower.highest = max(lower.highest, higher.highest, higher.cost)
+                lower.passed += higher.passed

@@ -58,8 +58,9 @@ class Descent(Descends):
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
     was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
     ``members`` are those of the prior ensemble from which descents go on as this one: its own, and of those that met
-    it, at J of up to ``highest``. ``settling`` is there once a regression has come close to its end.
-    ``at`` and ``step`` belong to the iteration under way.
+    it, at J of up to ``highest``; ``passed`` are steps of theirs, and J to which these led by the linearisation.
+    ``settling`` is there once a regression has come close to its end. ``at`` and ``step`` belong to the iteration under
+    way.
     """
 
     weights: Weights
@@ -69,6 +70,7 @@ class Descent(Descends):
     members: tuple[int, ...] = ()
     highest: float = -math.inf
     settling: Settling | None = None
+    passed: tuple[tuple[GaussNewtonStep, float], ...] = ()
     at: Iterate | None = None
     step: Step | GaussNewtonStep | None = field(default=None, kw_only=True)
 

@@ -197,7 +197,8 @@ def _guided(
 
 
 def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
-    """Student t about the minima, all alike, and the prior; in the prior's coordinates."""
+    """Student t about the minima, all alike and in each of their shapes, and the prior; in the prior's coordinates."""
+    minima = [shape for m in minima for shape in (m, *m.shapes)]
     n, count = len(prior.names), len(minima)
     share = np.append(np.full(count, (1 - OF_PRIOR) / count), OF_PRIOR)
     centre = np.vstack([*(prior.white(m.x) for m in minima), np.zeros(n)])
