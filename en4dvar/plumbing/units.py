@@ -78,6 +78,7 @@ UNPREFIXED = {
     "week": _unit("604800", s=1),
     **dict.fromkeys(("yr", "year"), _unit("31557600", s=1)),  # Julian, 365.25 d
     "atm": _unit("101325", m=-1, kg=1, s=-2),
+    "psi": _unit("6894.757293168361", m=-1, kg=1, s=-2),
 }
 PREFIXES = {"T": 12, "G": 9, "M": 6, "k": 3, "h": 2, "d": -1, "c": -2, "m": -3, "u": -6, "n": -9, "p": -12, "f": -15}
 

@@ -237,9 +237,10 @@ def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
 
 def overview_figures(sets: Sequence[SetSummary], population: Collection[str] = ()) -> list[Captioned]:
     """The estimates; where there is a ``population``, those of its parameters first and the others by themselves."""
+    rings = any(row.untrusted for dataset in sets for row in dataset.rows.values())
     caption = (
         "Each data set by itself: posterior mean and 5–95 % (blue), 5–95 % of the prior (grey, each data set's own "
-        "where they differ clearly). Orange rings without a bar: not to be trusted, for their warnings."
+        "where they differ clearly)." + " Orange rings without a bar: not to be trusted, for their warnings." * rings
         if len(sets) <= NAMED
         else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); 5–95 % "
         "of the prior (grey, each data set's own where they differ clearly)."

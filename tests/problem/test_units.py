@@ -36,6 +36,7 @@ from en4dvar.plumbing.units import Quantity, UnitError, as_unit, convert, parse_
         ("0.1 1/yr", "1/d", 0.1 / 365.25),
         ("1 year", "d", 365.25),
         ("1 atm", "bar", 1.01325),
+        ("1 psi", "Pa", 0.45359237 * 9.80665 / 0.0254**2),
         ("5 Pa s^0.6", "kg/(m s^1.4)", 5.0),
         ("5 kPa s**0.6", "Pa s^+0.6", 5000.0),
         ("4 kPa^0.5", "Pa^0.5", 4 * 10**1.5),
