@@ -214,8 +214,8 @@ MOSTLY = 0.8  # of the steps are whole frames: this is a film
 WHOLE = 0.1  # of a frame: times may be rounded
 ODD = 0.25  # of a frame off the next whole number
 SAME = 0.01  # rates that agree within this are the same
-_STEP = re.compile(r"(?i)(.*\.)?(delta_?t|dt|t_?step|time_?step)")
-_RATE = re.compile(r"(?i)(.*\.)?(fps|frame_?rate|f_?rate)")
+_STEP = re.compile(r"(?i)(.*\.)?(delta_?t|dt|t_?step|time_?step)(_[numµ]?s)?")
+_RATE = re.compile(r"(?i)(.*\.)?(fps|frame_?rate|f_?rate)(_[kM]?Hz)?")
 
 
 def step_doubts(

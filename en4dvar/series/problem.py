@@ -185,8 +185,8 @@ def too_few_at_start(problem: SeriesProblem) -> Iterator[str]:
     if whole and settings.localisation is None and settings.model_error is None and problem.members <= size:
         yield (
             f"{problem.members} members are fewer than the {size + 1} that a state of {size} uncertain numbers needs: "
-            "what they do not span stays as wrong as it is at the start, unless the model itself forgets it, and the "
-            "spread may be far too small; give more members, or localisation"
+            "what they do not span stays as wrong as it is at the start, unless the model itself forgets it, as a "
+            "chaotic one may, and the spread may be far too small; give more members, or localisation"
         )
 
 

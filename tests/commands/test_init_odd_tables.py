@@ -181,6 +181,20 @@ def test_areas_are_no_radii(tmp_path: Path) -> None:
     assert f"'Area' seems to hold areas; {words}" in output
 
 
+def test_a_comment_that_states_its_unit_tells_as_much_as_one_without(tmp_path: Path) -> None:
+    """Of ``Req_um`` and ``dt_us`` the proposal knew nothing, but of ``Req`` and ``dt``."""
+    head = "# Req: 0.03 mm\n# dt: 1.6 us\nR_um\n"
+    code, output = told(tmp_path, head + "".join(f"{R:.3f}\n" for R in radii()))
+    assert code == 0, output
+    text = (tmp_path / "b.yaml").read_text(encoding="utf-8")
+    assert "R_eq: {from_file: Req_mm, unit: mm}" in text
+    assert "time: {step: dt_us, unit: us}" in text
+    assert proposed(tmp_path / "b.yaml")
+    _, output = told(tmp_path, rows("# Req: 3 mm\n# dt: 2.0 us\nt_us,R_um\n", radii()), "--force")
+    assert "warning: Req_mm 3 of the file is not used: in mm it is no plausible R_eq\n" in output
+    assert "the times are 1.6 us apart, but dt_us of the file is 2" in output
+
+
 def test_diameters_in_german(tmp_path: Path) -> None:
     code, output = told(tmp_path, rows("Zeit_us;Durchmesser_um\n", 2 * radii(), "{:.3f};{:.3f}\n"))
     assert code == 0, output

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import TWO, bounded, linear, run, waved
-from toys import Fragile, Vectorised, make_problem
+from toys import Fragile, Linear, Vectorised, make_problem
 
 import en4dvar
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import off
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, missed, rank, validity, where_lost
+from en4dvar.diagnosis.honesty.coarse import coarse
 from en4dvar.diagnosis.honesty.examine import collapse, doubts
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
@@ -326,3 +327,17 @@ def test_members_that_are_all_the_same_are_far_from_any_spread():
     assert shift == 4
     assert 0 < ratio < 1e-300
     assert np.isfinite(1 / ratio)
+
+
+def test_turns_of_an_answer_that_is_made_of_straight_lines_are_not_called_an_error():
+    """Nobody sees in predictions whether a load changed its rate or outputs are rare; more outputs tell."""
+
+    class Loaded(Linear):
+        interpolated = ("y",)
+
+        def curve(self, theta, t):
+            return theta[0] * np.interp(t, [0.0, 0.8, 1.1, 9.0], [0.0, 1.0, 0.5, 9.0])
+
+    (told,) = coarse(run(make_problem(Loaded(("a", "b")), (1.0, 0.5), k=40, std=0.05)))
+    assert told.words.startswith("the model's outputs of y seem to be about")
+    assert told.advice.endswith("; if it does, its answer is made of straight lines, and nothing is wrong")

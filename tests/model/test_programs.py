@@ -264,6 +264,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "retries": ({"retries": -1}, "model.retries: should be greater than or equal to 0"),
     "shell": ({"shell": "perhaps"}, "model.shell: "),
     "no shell": ({"command": "'./a && b' > {output}"}, "the program would get > as an argument; write shell: true"),
+    "no shell for a file": ({"command": "./a {input} >{output}"}, "would get >{output} as an argument"),
+    "no shell for two": ({"command": "./a {input}; ./b"}, "would get {input}; as an argument"),
     "scratch": ({"scratch": "nowhere"}, "nowhere: no such folder"),
     "key": ({"comand": "x"}, "model.comand: unknown key 'comand'; did you mean 'command'?"),
 }

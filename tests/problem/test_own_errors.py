@@ -90,6 +90,23 @@ def test_its_curvature_is_that_expected_of_its_density(freedom):
     assert noise.whitened_rows(np.zeros(K), STD[None], Predicted(np.full((1, K), 9.0)))[0, 0, -1] ** 2 < least
 
 
+class HalfStudent(Student):
+    """Gaussian errors of the first half of the readings."""
+
+    def influence(self, residual):
+        return np.where(np.arange(K) < K // 2, 1.0, super().influence(residual))
+
+    def _loss(self, v):
+        half = K // 2
+        return np.concatenate([0.5 * v[..., :half] ** 2, super()._loss(v[..., half:])], axis=-1)
+
+
+def test_the_expected_curvature_of_readings_that_are_told_apart_by_their_place():
+    """A loss is of (…, K): asked for that of a single column it gave that of the first reading for all."""
+    expected = np.where(np.arange(K) < K // 2, 1.0, 4 / 6)
+    np.testing.assert_allclose(HalfStudent(STD, 0 * STD).expected_curvature, expected, rtol=1e-4)
+
+
 def test_a_down_weighted_reading_is_told_as_far_off_as_it_is():
     """Not the threshold over its weight, which is so of Huber's ρ with one threshold alone."""
     problem = make_problem(Linear(("a",)), [1.0])

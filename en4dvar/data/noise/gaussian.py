@@ -192,9 +192,13 @@ class Noise:
     @cached_property
     def expected_curvature(self) -> float | Array:
         """E[ρ''] under the density of ρ: of all readings, or (K,). It is E[ρ'²], which needs no ρ''."""
-        v = GRID[:, None]
-        density = np.exp(-self._loss(v)) * WIDTHS[:, None]
-        return np.asarray(np.sum(density * (v * self.influence(v)) ** 2, axis=0) / density.sum(axis=0))
+        whole, squares = np.zeros((2, len(self.std)))
+        for v, width in zip(GRID[::4], WIDTHS[::4], strict=True):
+            of_each = np.full(len(self.std), v)  # which may differ from reading to reading
+            density = np.exp(-self._loss(of_each)) * width
+            whole += density
+            squares += density * (of_each * self.influence(of_each)) ** 2
+        return np.asarray(squares / whole)
 
     def _curvature(self, light: Array) -> Array:
         """What stands for ρ''(v) (…, K) in SᵀS: its expectation, or ρ'/v of a reading so far off that it counts less.

@@ -33,8 +33,8 @@ def coarse(analysis: Analysis) -> Findings:
         share = gap / 8 * np.abs([turns[group].sum() for group in groups]) / std[places]
         if share[worst := int(np.argmax(share))] > TOLD:
             words = (
-                f"the model's outputs of {part.observable.name} are about {len(t) / (len(groups) + 1):.2g} readings "
-                f"apart, and straight lines between them: near {moments(a)[part.begin + places[worst]]} {CLOCK} these "
-                f"are off by about {share[worst]:.2g} times the readings' error"
+                f"the model's outputs of {part.observable.name} seem to be about {len(t) / (len(groups) + 1):.2g} "
+                f"readings apart, with straight lines between them: near {moments(a)[part.begin + places[worst]]} "
+                f"{CLOCK} these would be off by about {share[worst]:.2g} times the readings' error"
             )
             yield caution("coarse-outputs", words)

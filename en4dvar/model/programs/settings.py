@@ -28,7 +28,7 @@ LOGARITHM = "log10("  # how a term log10(name) of a combination begins
 OWN_NAMES = ("input", "output", "here", "python", TIMES)
 _NAME = re.compile(r"\{([A-Za-z_]\w*)\}")
 _QUOTED = re.compile(r"""\\.|'[^']*'|"(?:\\.|[^"\\])*\"""")
-OF_A_SHELL = ("&&", "||", "|", ";", "&", ">", ">>", "<", "2>", "2>&1", "&>")  # words that no program is meant to get
+_OF_A_SHELL = re.compile(r"([\d&]?>|<|&&|\|).*|.*;|&")  # words that no program is meant to get
 _WRITTEN = re.compile(r">+\s*\S+")  # into a file, by a shell
 WAYS = ("column", "key", "pattern", "instructions")
 
@@ -186,7 +186,7 @@ def _placed(command: str, info: ValidationInfo) -> str:
     first, *others = split(command, shell)
     if shell:
         return command
-    if sign := next((word for word in _QUOTED.sub("_", command).split() if word in OF_A_SHELL), ""):
+    if sign := next((word for word in _QUOTED.sub("_", command).split() if _OF_A_SHELL.fullmatch(word)), ""):
         raise ValueError(
             f"the program would get {sign} as an argument; write shell: true, or '{sign}' if that is meant"
         )

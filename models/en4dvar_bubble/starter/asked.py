@@ -64,7 +64,12 @@ class Asked:
     @property
     def step(self) -> str | None:
         """The scalar of the file that is the time between two readings, where nothing else gives their times."""
-        return None if self.time_column or self.time_step else _only(_STEP, self.contents.scalars)
+        return None if self.time_column or self.time_step else self._stated_step
+
+    @property
+    def _stated_step(self) -> str | None:
+        fitting = [name for name in self.contents.scalars if _STEP.fullmatch(without_unit(name, "s"))]
+        return fitting[0] if len(fitting) == 1 else None
 
     @property
     def errors(self) -> list[str]:
@@ -114,11 +119,11 @@ class Asked:
                 radius = radius or other.get(time or "")
                 if not time and radius and (self.frame_rate is None or np.all(np.diff(names[other[radius]]) > 0)):
                     time = other[radius]
-            if _only(_STEP, self.contents.scalars) is None:
+            if self._stated_step is None:
                 time = time or _only(FRAMES, names)
         named = replace(self, time_column=time, radius_column=radius)
         frames = self.frame_rate is not None and named._counts_frames
-        times = self.time_unit or (None if frames else self._unit(time, "s"))
+        times = self.time_unit or (None if frames else self._unit(time or named.step, "s"))
         radii = self.radius_unit or (None if self.pixel else self._unit(radius, "m"))
         return replace(named, time_unit=times, radius_unit=radii).of_camera()
 

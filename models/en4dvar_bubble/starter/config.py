@@ -294,19 +294,22 @@ def _with_delay(proposal: Proposal, delay: Mapping[str, str]) -> Proposal:
 
 def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) -> Proposal:
     """The radius at rest of the files, where every one has such a scalar that suits its readings in their unit."""
-    names = {name for series in readings.values() for name in series.scalars if _REST.fullmatch(name)}
+    names = {name for series in readings.values() for name in series.scalars if _REST.fullmatch(without_unit(name))}
     names = {name for name in names if not indexed(name)[1]} or names  # of expts(1).Req, … one that means each its own
     if len(names) != 1:
         return proposal
     (name,) = names
-    unit = unit.removeprefix("0.5*")  # of diameters; what is called a radius is none
+    stated = unit_in(name, "m")
+    unit = stated or unit.removeprefix("0.5*")  # of diameters; what is called a radius is none
     for series in readings.values():
         value = series.scalars.get(name, float("nan"))
         share = convert(value, unit, "m") / float(series.values.max())
         if not AT_REST[0] < share < AT_REST[1]:
-            words = f"{name} {value:g} of the file is not used: in {unit}, like its radii, it is no plausible R_eq"
+            like = "" if stated else ", like its radii,"
+            words = f"{name} {value:g} of the file is not used: in {unit}{like} it is no plausible R_eq"
             return replace(proposal, warnings=(*proposal.warnings, words))
     words = f"from the file, in the unit of its readings; without it G is uncertain; is it really in {unit}?"
+    words = "from the file; without it G is uncertain" if stated else words
     entry = Entry("R_eq", braced(from_file=name, unit=unit), words)
     lines = tuple(entry if line.key == "R_eq" else line for line in proposal.parameters)
     return replace(proposal, parameters=lines)
