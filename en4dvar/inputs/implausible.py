@@ -298,8 +298,6 @@ def check_order(
     ends = np.flatnonzero(np.diff(times) < 0)
     if bounds and times[after] == times[before]:
         hint = APART
-    elif len(ends) >= SEVERAL and np.all(np.diff(values) > 0):
-        hint = "the readings do, from row to row: are the columns of times and readings exchanged?"
     elif column := _telling_apart(path, layout, kept, lines, wanted, times):
         name = column if column.isidentifier() else repr(column)
         hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"
@@ -307,6 +305,8 @@ def check_order(
         before, after = ends[0], ends[0] + 1
         hint = f"these look like {len(ends) + 1} series one after another: {apart}"
         hint += "; of one series whose clock began anew, add the time that had passed to the later times"
+    elif len(ends) >= SEVERAL and np.all(np.diff(values) > 0):
+        hint = "the readings do, from row to row: are the columns of times and readings exchanged?"
     elif times[after] != times[before]:
         hint = "correct it, or sort the rows (data.unsorted: sort)"
     elif _differ(times, values):

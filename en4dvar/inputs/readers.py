@@ -26,6 +26,7 @@ from en4dvar.inputs.implausible import (
     step_doubts,
 )
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
+from en4dvar.inputs.text_table import remarks_in
 from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
@@ -285,8 +286,10 @@ def scalar_of(column: Column, scalars: Mapping[str, float], path: Path, what: st
 def _step(step: TimeStep, scalars: Mapping[str, float], path: Path, lines: Sequence[int]) -> float:
     """The constant step. Raises :class:`DataError`: it is none, or a line of the table between others holds nothing."""
     skips = np.diff(lines)
+    if np.any(skips > min(skips, default=1)):
+        skips -= np.diff(np.searchsorted(remarks_in(path), lines))
     if len(uneven := np.flatnonzero(skips > min(skips, default=1))):
-        where = f"{path}:{lines[uneven[0]] + 1}: a line without a reading between others of a constant step"
+        where = f"{path}:{lines[uneven[0]] + min(skips)}: a line without a reading between others of a constant step"
         raise DataError(f"{where}; write NaN in it where a frame has none, or delete it where no frame is missing")
     value = step.value if step.column is None else scalar_of(step.column, scalars, path, "the time step")
     if not value > 0:

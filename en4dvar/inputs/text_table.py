@@ -50,6 +50,15 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
     return [(n, s) for n, s in lines if s.strip() and not s.lstrip().startswith(COMMENT)]
 
 
+def remarks_in(path: Path) -> list[int]:
+    """The numbers of the comments of a text, none of a sheet, that are no row of numbers, left out by a sign."""
+    lines = enumerate((_decoded(read_plain(path, LONGEST)) or "").splitlines(), 1)
+    comments = [(n, s.strip().lstrip("#%/ \t")) for n, s in lines if s.lstrip().startswith(COMMENT)]
+    signs = [delimiter_of(s, path) for _, s in comments]
+    cells = [cells_of(s, sign)[: None if sign else 1] for (_, s), sign in zip(comments, signs, strict=True)]
+    return [n for (n, _), own in zip(comments, cells, strict=True) if not _holds_number(own)]
+
+
 def scalars_in(path: Path) -> dict[str, float]:
     """What comments such as ``# Req = 21.79`` say, by name; ``# delay: 7 us`` is ``delay_us``."""
     said = filter(None, (_SCALAR.fullmatch(line.strip()) for line in _text(path).splitlines()))

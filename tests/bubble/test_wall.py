@@ -17,8 +17,9 @@ from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.driving import tabulated
 from en4dvar_bubble.dynamics import Wall
 from en4dvar_bubble.medium import Medium
-from en4dvar_bubble.starter.elsewhere import BY_VISCOSITY
+from en4dvar_bubble.starter.elsewhere import BY_VISCOSITY, plane_in_a_gel
 from en4dvar_bubble.starter.guess import OF_GELS
+from en4dvar_bubble.starter.look import look
 from en4dvar_bubble.starter.proposal import propose
 
 APECSS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "apecss"
@@ -225,9 +226,24 @@ def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wal
         assert warnings[0].endswith("--set model.wall.distance='750 um'")
         of_several = propose({"a": history_in_gel(), "b": bubble, "c": history_in_gel()}, "laser").warnings
         (told_b,) = [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
-        assert re.search(r"in the other 2 it takes 1\.0\d: radii 1\.\d+ times too small, or the time step", told_b)
+        scale = r"and 2 others [01]\.\d\d of what they would there: radii 1\.\d+ times too small, or the time step"
+        assert re.search(scale, told_b)
         assert "for these files alone" in told_b  # else it would hold for every bubble of the folder
         assert "alone" not in "".join(propose({"a": bubble, "b": bubble, "c": history_in_gel()}, "laser").warnings)
+
+
+def test_a_bubble_is_slow_beside_what_others_would_take_by_their_own_size():
+    """Small ones take longer by viscosity, so that radii of a large one by a plane were "too large"; and what has no
+    possible scale tells nothing of another's.
+    """
+    small, large = history_in_gel(mu=0.08, R_max=80e-6, R_eq=12e-6), history_in_gel(Wall(750e-6))
+    looks = {name: look(*history, "laser") for name, history in {"a": small, "b": small, "c": large}.items()}
+    (told,) = plane_in_a_gel(looks, Medium())
+    assert re.search(r"^c: .*, and 2 others 1.0\d of what they would there: radii 1.\d+ times too small", told)
+    looks |= {name: look(0.3 * small[0], small[1], "laser") for name in "ab"}
+    (told,) = plane_in_a_gel(looks, Medium())
+    assert "radii" not in told
+    assert "for these files alone" in told
 
 
 @pytest.mark.skipif(not MEASURED.exists(), reason="../shared/data/bubbles is not there")

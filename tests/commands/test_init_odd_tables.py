@@ -16,6 +16,7 @@ from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.inputs.implausible import outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import Layout, read_contents
+from en4dvar_bubble.starter.config import AREA
 from en4dvar_bubble.starter.grouped import ends_with
 
 TIMES = np.arange(1, 84) * 1.6
@@ -179,6 +180,8 @@ def test_areas_are_no_radii(tmp_path: Path) -> None:
     assert (code, words in output) == (2, True)
     _, output = told(tmp_path, text, "--radius-column", "Area", "--radius-unit", "um", "--force")
     assert f"'Area' seems to hold areas; {words}" in output
+    assert all(map(AREA.match, ("area_um2", "Bubble Area", "Fläche [px]", "Blasenflaeche_um2")))
+    assert not any(map(AREA.match, ("Area_R_um", "area_equivalent_radius", "Area eq. diameter", "Radius_area")))
 
 
 def test_a_comment_that_states_its_unit_tells_as_much_as_one_without(tmp_path: Path) -> None:

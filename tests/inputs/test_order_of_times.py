@@ -75,6 +75,14 @@ def test_times_in_the_column_of_readings_are_not_sorted(tmp_path: Path) -> None:
     assert told.endswith("are the columns of times and readings exchanged?")
 
 
+def test_series_whose_readings_grow_from_each_to_the_next_are_not_exchanged_columns(tmp_path: Path) -> None:
+    """As of a count that goes on while the clock begins anew; a column that tells them apart was not named."""
+    rows = [("abcdef"[k // 6], k % 6, 1 + k) for k in range(36)]
+    assert "(data.by: run)" in advice(tmp_path / "t.csv", "run,t,R", rows, "refuse")
+    told = advice(tmp_path / "t.csv", "t,R", [row[1:] for row in rows], "refuse")
+    assert "these look like 6 series one after another" in told
+
+
 def test_of_vectors_no_column_is_asked_for(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"t": np.tile(T, 2), "R": np.concatenate([A, B])})
     with pytest.raises(DataError, match=r"sample 21: .*: give each a file of its own; of one series [a-z ,]*$"):

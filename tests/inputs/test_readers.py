@@ -205,6 +205,13 @@ def test_a_blank_line_is_no_frame_of_a_constant_step_in_silence(tmp_path: Path) 
         read("R\n\n5\n6\n\n7\n8\n\n")
     assert read("R\n5\n6\nNaN\n7\n8\n\n\n") == [0.0, 2.0, 6.0, 8.0]
     assert read("R\n\n5\n\n6\n\n7\n") == [0.0, 2.0, 4.0]  # every other line, as some programs write
+    assert read("R,n\n5,1\n# Req = 3\n# block 2, of 9 rows\n6,1\n#\n7,1\n") == [0.0, 2.0, 4.0]
+    for left_out in ("# 6,1", "#b,1", "#;6"):  # a row, by a comment
+        with pytest.raises(DataError, match=r"a\.csv:3: a line without a reading"):
+            read(f"R,n\n5,1\n{left_out}\n7,1\n8,1\n")
+    with pytest.raises(DataError, match=r"a\.csv:7: .* write NaN in it"):
+        read("R\n\n5\n\n6\n\n\n\n7\n")
+    assert read("R\n\n5\n\n6\n\nNaN\n\n7\n") == [0.0, 2.0, 6.0]
 
 
 def test_bad_mat(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ _PLAIN = re.compile(r"([A-Za-z_]|\.{0,2}/)([\w ./*-]*[\w./*])?")
 _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 DIAMETER = re.compile(r"(?i)(d|(.*[\W_])?diam\w*|.*durchmesser)([ _(\[].*)?$")
-AREA = re.compile(r"(?i)(.*[\W_])?(area|fläche)([ _(\[].*)?$")
+AREA = re.compile(r"(?i)(?!.*(rad(ius|ii)|diam|durchm|(\b|_)r(\b|_)))((.*[\W_])?area|.*fl(ä|ae)che)([ _(\[].*)?$")
 EACH_ROW = (
     "each row is taken for the next frame: one that has no row, as where no bubble was seen, makes all "
     "later times too early; give a column of times or of frames, or write NaN in its row"
@@ -320,9 +320,7 @@ def doubts(source: Source) -> list[str]:
     words = []
     for what, kind, column in (("times", "s", source.time), ("radii", "m", source.radius)):
         if column is None:
-            words += [EACH_ROW] * (
-                source.step_unit is None
-            )  # else the file states the step, as one that keeps all frames
+            words += [EACH_ROW] * (source.step_unit is None)  # else the file states it, as one that keeps all frames
             continue
         name, unit = column
         diameter, pixels, scaled = bool(DIAMETER.match(name)), PIXELS.search(name), "*" in unit

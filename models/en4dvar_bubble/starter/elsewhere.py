@@ -217,16 +217,19 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
     for name, view in views.items():
         lobe, unsure = view.lobe, view.top.time_std / view.lobe.t_c
         usual = 1 + BY_VISCOSITY * mu / (lobe.R_max * math.sqrt(medium.rho * medium.p_inf))
-        if (ratio := lobe.rayleigh_ratio(medium)) > usual + unsure and not doubt(lobe, medium):
+        if doubt(lobe, medium):
+            continue
+        if (ratio := lobe.rayleigh_ratio(medium)) > usual + unsure:
             slow[name] = ratio, usual, 1e6 * lobe.R_max
         else:
-            others.append(ratio)
+            others.append(ratio / usual)  # small bubbles take longer than large ones
     if not slow:
         return []
     ratio, usual, radius = np.median([*slow.values()], axis=0)
     names = f"{listed(slow, 3)}: " * (len(views) > 1)
-    few, rest = len(others) > len(slow), float(np.median(others or [ratio]))
-    scale = f", in the other {len(others)} it takes {rest:.2f}: {explained(rest / float(ratio))}?" if few else "."
+    rest, few = float(np.median(others or [1.0])), len(views) > 2 * len(slow)
+    told = len(others) > len(slow) and (factor := rest * float(usual / ratio)) < 0.99
+    scale = f", and {len(others)} others {rest:.2f} of what they would there: {explained(factor)}?" if told else "."
     alone = ", for these files alone, in a folder of their own" * few
     near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
     return [
