@@ -188,10 +188,8 @@ def localisation_of(
     """Positions are indices of the one observed field, which fills the state but for the parameters. ``cells`` (p,) are
     the indices of the observations, by default all. Raises :class:`ConfigError`.
     """
-    fields, words = (
-        list(dynamic_fields(model).values()),
-        "needs a model whose state is one field, and this field observed",
-    )
+    fields = list(dynamic_fields(model).values())
+    words = "needs a model whose state is one field, and this field observed"
     if len(fields) != 1:
         raise ConfigError(words)
     read = [field_of(model, observable) for observable in model.observables if observable.name in observed]

@@ -44,11 +44,8 @@ def test_both_arms_of_a_posterior_that_is_bent_at_a_kink_are_sampled(seed, emula
 @pytest.mark.slow
 def test_exponentials_that_may_be_exchanged_are_sampled_both_ways():
     """Against a population of its own; a part of the mode of a < 0.9, which holds two thirds, was left out."""
-    rng, t, medians = (
-        np.random.default_rng([3, 5]),
-        np.linspace(0.3, 6, 12),
-        dict(zip("akbl", (1, 0.5, 1, 2), strict=True)),
-    )
+    rng, t = np.random.default_rng([3, 5]), np.linspace(0.3, 6, 12)
+    medians = dict(zip("akbl", (1, 0.5, 1, 2), strict=True))
     error, logs = float(10 ** rng.uniform(-3, -0.5)), np.log(list(medians.values()))
 
     def two(p, t):
